@@ -1,0 +1,325 @@
+"""Frozen configuration of the task, the robot, the LiDAR, the map and the physics: pure data, no torch, no simulator.
+
+The only place where a default is written down. A field's docstring gives its unit; ``cura-torchrl train --help`` prints it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+ScenarioKind = Literal["uniform", "adversarial", "mixed"]
+Stream = Literal["train", "eval", "vae"]
+
+
+def require(condition: bool, what: str, value: object, accepted: str) -> None:
+    """Raise a one-line error unless a configuration value is acceptable.
+
+    Args:
+        condition: Whether the value is acceptable.
+        what: Name of the field.
+        value: The value that was given.
+        accepted: The values that are accepted, in words.
+
+    Raises:
+        ValueError: If ``condition`` is false.
+
+    Examples:
+        >>> require(-1 > 0, "episode_time", -1, "a positive number of seconds")
+        Traceback (most recent call last):
+        ValueError: episode_time is -1; accepted: a positive number of seconds
+    """
+    if not condition:
+        msg = f"{what} is {value!r}; accepted: {accepted}"
+        raise ValueError(msg)
+
+
+def require_finite(config: object) -> None:
+    """Raise unless every number in a dataclass, nested tuples included, is finite.
+
+    Args:
+        config: A dataclass instance.
+
+    Raises:
+        ValueError: If a float field is NaN or infinite.
+
+    Examples:
+        >>> require_finite(LidarConfig())
+    """
+    for item in dataclasses.fields(config):  # type: ignore[arg-type]
+        value = getattr(config, item.name)
+        for number in _numbers(value):
+            require(math.isfinite(number), f"{type(config).__name__}.{item.name}", value, "finite numbers")
+
+
+def _numbers(value: object) -> list[float]:
+    if isinstance(value, float):
+        return [value]
+    if isinstance(value, tuple):
+        return [number for entry in value for number in _numbers(entry)]
+    return []
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenarioConfig:
+    """What an episode looks like before it starts. World frame: x points from start to goal."""
+
+    kind: ScenarioKind = "mixed"
+    """Where obstacles appear: anywhere in the region, on the object-to-goal line, or either with equal chance."""
+    object_edges: tuple[float, ...] = (0.5, 0.75, 1.0)
+    """Edge lengths of the pushed cube [m]; one is drawn with equal chance."""
+    max_obstacles: int = 6
+    """Most obstacles K in an episode; the count is uniform in 0..K. Range: 0 to 6."""
+    obstacle_edges: tuple[float, ...] = (0.4, 0.6, 1.0)
+    """Edge lengths of an obstacle cube [m]; one is drawn with equal chance."""
+    obstacle_x: tuple[float, float] = (3.0, 11.0)
+    """Where obstacles may appear, world x [m]."""
+    obstacle_y: tuple[float, float] = (-3.0, 3.0)
+    """Where obstacles may appear, world y [m]."""
+    obstacle_time: tuple[float, float] = (0.0, 15.0)
+    """When an obstacle appears [s]."""
+    obstacle_clearance: float = 1.0
+    """Least distance of an appearing obstacle from the surfaces of robot and object [m]."""
+    obstacle_gap: float = 0.1
+    """Least distance between the circumscribed circles of an appearing obstacle and one that is there already [m]."""
+    adversarial_jitter: float = 0.3
+    """Lateral offset from the object-to-goal line in the adversarial scenario, uniform in plus or minus this [m]."""
+    num_fallbacks: int = 8
+    """Ordered places an obstacle tries before it waits for the next policy step [1]."""
+    object_y: tuple[float, float] = (-1.0, 1.0)
+    """Object's start, world y [m]; its x is 0."""
+    object_yaw: tuple[float, float] = (-0.6, 0.6)
+    """Object's start yaw [rad]."""
+    goal_x: tuple[float, float] = (12.0, 14.0)
+    """Goal, world x [m]."""
+    goal_y: tuple[float, float] = (-2.0, 2.0)
+    """Goal, world y [m]; its yaw is uniform over the circle."""
+    start_gap: tuple[float, float] = (0.2, 0.6)
+    """Distance from the TCP to the nearest face at the start [m]."""
+    start_lateral: tuple[float, float] = (-0.5, 0.5)
+    """Lateral offset of the robot behind the object at the start [m]."""
+    start_yaw: tuple[float, float] = (-0.3, 0.3)
+    """Robot's start yaw [rad]."""
+    object_mass: tuple[float, float] = (3.0, 10.0)
+    """Object's mass [kg]."""
+    floor_friction: tuple[float, float] = (0.25, 0.6)
+    """Coulomb friction between object and floor [1]."""
+    com_shift: float = 0.1
+    """Offset of the object's centre of mass along each axis, as a share of the edge, uniform in plus or minus this [1]."""
+
+    def __post_init__(self) -> None:
+        require_finite(self)
+        require(0 <= self.max_obstacles <= 6, "max_obstacles", self.max_obstacles, "0 to 6")
+        require(self.num_fallbacks >= 1, "num_fallbacks", self.num_fallbacks, "1 or more")
+        for name in ("object_edges", "obstacle_edges"):
+            edges = getattr(self, name)
+            require(bool(edges) and min(edges, default=0.0) > 0, name, edges, "one or more positive lengths [m]")
+        for name in _RANGES:
+            low, high = getattr(self, name)
+            require(low <= high, name, (low, high), "a range whose first number is not the larger one")
+        for name in ("object_mass", "floor_friction"):
+            require(getattr(self, name)[0] > 0, name, getattr(self, name), "positive numbers")
+
+
+_RANGES = (
+    "obstacle_x", "obstacle_y", "obstacle_time", "object_y", "object_yaw", "goal_x", "goal_y",
+    "start_gap", "start_lateral", "start_yaw", "object_mass", "floor_friction",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardConfig:
+    """Weights and scales of the paper's reward (Table I)."""
+
+    keypoint_weight: float = 4.0
+    """w1, weight of the distance between the object's and the goal's corners [1]."""
+    progress_weight: float = 2.0
+    """w2, weight of the direction of the object's velocity [1]."""
+    velocity_weight: float = 1.0
+    """w3, weight of the object's speed [1]."""
+    contact_weight: float = 1.0
+    """w4, weight of the distance from the end-effector to a point on the object's surface [1]."""
+    action_rate_weight: float = -0.1
+    """w5, weight of the change of the action [1]."""
+    acceleration_weight: float = -0.1
+    """w6, weight of the joint acceleration [1]."""
+    keypoint_scale: float = 0.25
+    """Decay of the keypoint term [1/m]."""
+    progress_scale: float = 5.0
+    """Sharpness of the progress term [1]."""
+    contact_scale: float = 0.1
+    """Decay of the contact-point term [1/m]."""
+    max_speed: float = 0.8
+    """v_max, speed that the velocity term divides by: the base's maximum [m/s]."""
+    slow_speed: float = 0.25
+    """Below this the object's velocity counts as zero in the progress term [m/s]; 0 is the letter of the paper."""
+    near_goal: float = 0.02
+    """Below this distance the direction to the goal counts as zero [m]."""
+
+    def __post_init__(self) -> None:
+        require_finite(self)
+        require(self.max_speed > 0, "max_speed", self.max_speed, "a positive speed [m/s]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig:
+    """The task: scenario, reward, and what ends an episode."""
+
+    scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
+    """Layout, object and obstacles."""
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    """Reward weights and scales."""
+    stream: Stream = "train"
+    """Which independent stream of scenarios is played."""
+    policy_period: float = 0.2
+    """Time between two actions [s]; the paper's 5 Hz."""
+    episode_time: float = 50.0
+    """Time limit of an episode [s]."""
+    success_time: float = 5.0
+    """Time the episode plays on after the goal is first reached [s]."""
+    tolerances: tuple[float, float, float] = (0.5, 0.25, 0.10)
+    """Distance from object to goal that counts as success [m]; the first is the headline."""
+    yaw_tolerance: float = math.radians(10.0)
+    """Yaw error allowed by the last tolerance, modulo a quarter turn [rad]."""
+    tilt_limit: float = math.radians(30.0)
+    """Tilt of the object beyond which it counts as tipped [rad]."""
+    random_first_age: bool = False
+    """Whether the first episode of each world starts at a random age of the time limit, so that resets spread out."""
+    curriculum: tuple[tuple[int, int], ...] = ()
+    """Steps (frames, K): from this many frames on, at most K obstacles; empty means ``scenario.max_obstacles`` throughout."""
+
+    def __post_init__(self) -> None:
+        require_finite(self)
+        require(self.policy_period > 0, "policy_period", self.policy_period, "a positive time [s]")
+        require(self.episode_time >= self.policy_period, "episode_time", self.episode_time, "at least one policy period [s]")
+        frames = [step[0] for step in self.curriculum]
+        require(frames == sorted(frames), "curriculum", self.curriculum, "steps in increasing frames")
+        require(all(0 <= step[1] <= 6 for step in self.curriculum), "curriculum", self.curriculum, "0 to 6 obstacles")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotConfig:
+    """Limits and control gains of Ridgeback and Panda."""
+
+    max_base_speed: float = 0.8
+    """Largest base speed [m/s]; the paper's v_max."""
+    max_base_yaw_rate: float = 1.0
+    """Largest base yaw rate [rad/s]."""
+    max_base_acceleration: float = 2.5
+    """Largest base acceleration [m/s^2]; ridgeback_control's control.yaml."""
+    max_base_yaw_acceleration: float = 1.0
+    """Largest base yaw acceleration [rad/s^2]; ridgeback_control's control.yaml."""
+    max_tcp_speed: float = 0.5
+    """Largest end-effector speed relative to the base, per axis [m/s]."""
+    ik_damping: float = 0.02
+    """Damping factor lambda of the damped least squares; the paper's value [1]."""
+    ik_rate: float = 25.0
+    """Rate at which the differential IK is solved [Hz]; joint references are integrated at the control rate in between."""
+    posture_gain: float = 1.0
+    """Gain of the null-space posture task [1/s]."""
+    orientation_gain: float = 4.0
+    """Gain of the hand's orientation task [1/s]."""
+    max_hand_yaw: float = 0.8
+    """Largest angle between the hand's axis and the base's x axis in the plane [rad]."""
+    hand_tilt: float = 0.5
+    """Downward tilt of the hand's axis below the horizontal [rad]."""
+    workspace_x: tuple[float, float] = (0.68, 1.05)
+    """Where the TCP reference may be, base frame x [m]."""
+    workspace_y: tuple[float, float] = (-0.45, 0.45)
+    """Where the TCP reference may be, base frame y [m]."""
+    workspace_z: tuple[float, float] = (0.15, 0.45)
+    """Where the TCP reference may be, height above the ground [m]; the tipping bound lowers the upper end."""
+    stiffness: tuple[float, ...] = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)
+    """Joint stiffness K [N m/rad]; franka-interface."""
+    damping: tuple[float, ...] = (50.0, 50.0, 50.0, 50.0, 30.0, 25.0, 15.0)
+    """Joint damping D [N m s/rad]; franka-interface."""
+
+    def __post_init__(self) -> None:
+        require_finite(self)
+        for name in ("max_base_speed", "max_base_yaw_rate", "max_tcp_speed", "ik_damping", "ik_rate"):
+            require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
+        require(len(self.stiffness) == 7 and len(self.damping) == 7, "stiffness, damping", (self.stiffness, self.damping), "7 each")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LidarConfig:
+    """The base-mounted planar LiDAR."""
+
+    num_rays: int = 360
+    """Rays per turn [1]."""
+    max_range: float = 10.0
+    """Largest range, and what a miss reads [m]; Hokuyo UST-10LX."""
+    height: float = 0.26
+    """Height of the scan plane above the ground [m]; ridgeback_description."""
+    noise: float = 0.01
+    """Standard deviation of the range noise [m]."""
+    occlusion: bool = True
+    """Whether rays see the pushed object; off, they pass through it."""
+
+    def __post_init__(self) -> None:
+        require_finite(self)
+        require(8 <= self.num_rays <= 8192, "num_rays", self.num_rays, "8 to 8192")
+        require(self.max_range > 0 and self.noise >= 0, "max_range, noise", (self.max_range, self.noise), "positive, not negative [m]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapConfig:
+    """The confidence map and the window that the policy sees."""
+
+    decay: float = 0.9
+    """alpha: an unseen cell's confidence is multiplied by this each step [1]; 1 accumulates. Range: 0 to 1."""
+    resolution: float = 0.1
+    """Edge of a cell [m]."""
+    window: int = 100
+    """Cells along the edge of the robot-centred window [1]."""
+    extent_x: tuple[float, float] = (-6.0, 18.0)
+    """World x covered by the global map [m]; outside everything is unseen."""
+    extent_y: tuple[float, float] = (-8.0, 8.0)
+    """World y covered by the global map [m]; outside everything is unseen."""
+    channels: Literal["confidence+occupancy", "product", "confidence"] = "confidence+occupancy"
+    """What the window holds: M and O; M times O; or M alone (the letter of the paper's Eq. 2)."""
+
+    def __post_init__(self) -> None:
+        require_finite(self)
+        require(0.0 <= self.decay <= 1.0, "decay", self.decay, "0 to 1")
+        require(self.resolution > 0 and self.window > 0, "resolution, window", (self.resolution, self.window), "positive numbers")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhysicsConfig:
+    """The simulator's clock and contact."""
+
+    control_period: float = 0.005
+    """Time step of control and physics [s]; the paper's 200 Hz."""
+    gravity: float = 9.81
+    """Weight of the object per mass [m/s^2]; the arm is gravity-compensated and feels none."""
+    hand_friction: float = 1.5
+    """Bullet's friction of the robot's links; Bullet multiplies it by the object's [1]."""
+    solver_iterations: int = 50
+    """Constraint solver iterations per tick [1]."""
+
+    def __post_init__(self) -> None:
+        require_finite(self)
+        require(self.control_period > 0, "control_period", self.control_period, "a positive time [s]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushEnvConfig:
+    """Everything that :class:`cura_torchrl.envs.push.PushEnv` is built from."""
+
+    task: TaskConfig = field(default_factory=TaskConfig)
+    """Scenario, reward, endings."""
+    robot: RobotConfig = field(default_factory=RobotConfig)
+    """Limits and gains."""
+    lidar: LidarConfig = field(default_factory=LidarConfig)
+    """Range sensor."""
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    """Clock and contact."""
+    simulator: Literal["bullet"] = "bullet"
+    """Which simulator runs the worlds."""
+
+    def __post_init__(self) -> None:
+        ticks = self.task.policy_period / self.physics.control_period
+        require(abs(ticks - round(ticks)) < 1e-6, "control_period", self.physics.control_period, "a divisor of policy_period")
