@@ -54,6 +54,9 @@ EPISODE = "episode"
 ELAPSED_STEPS = "elapsed_steps"
 """Policy steps since the start of the episode, int64, shape ``[*, 1]``."""
 
+OBSTACLES = "obstacles"
+"""True obstacles (x [m], y [m], yaw [rad], edge [m]) in the world frame, edge 0 where none has appeared, shape ``[*, 6, 4]``; privileged."""
+
 STATE_VALUE = "state_value"
 """Critic's estimate of the return, shape ``[*, 1]``."""
 

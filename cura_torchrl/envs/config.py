@@ -187,6 +187,8 @@ class TaskConfig:
     """Tilt of the object beyond which it counts as tipped [rad]."""
     random_first_age: bool = False
     """Whether the first episode of each world starts at a random age of the time limit, so that resets spread out."""
+    privileged: bool = False
+    """Whether observations include the true obstacles, for scripted policies and diagnosis."""
     curriculum: tuple[tuple[int, int], ...] = ()
     """Steps (frames, K): from this many frames on, at most K obstacles; empty means ``scenario.max_obstacles`` throughout."""
 
@@ -219,22 +221,30 @@ class RobotConfig:
     """Rate at which the differential IK is solved [Hz]; joint references are integrated at the control rate in between."""
     posture_gain: float = 1.0
     """Gain of the null-space posture task [1/s]."""
+    position_gain: float = 5.0
+    """Gain with which the joint reference follows the TCP's reference [1/s]."""
+    tcp_leash: float = 0.05
+    """Furthest the TCP's reference may be from that of the joints, per axis [m]."""
     orientation_gain: float = 4.0
     """Gain of the hand's orientation task [1/s]."""
     max_hand_yaw: float = 0.8
     """Largest angle between the hand's axis and the base's x axis in the plane [rad]."""
-    hand_tilt: float = 0.5
+    hand_tilt: float = 0.9
     """Downward tilt of the hand's axis below the horizontal [rad]."""
-    workspace_x: tuple[float, float] = (0.68, 1.05)
+    workspace_x: tuple[float, float] = (0.76, 1.03)
     """Where the TCP reference may be, base frame x [m]."""
-    workspace_y: tuple[float, float] = (-0.45, 0.45)
+    workspace_y: tuple[float, float] = (-0.4, 0.4)
     """Where the TCP reference may be, base frame y [m]."""
-    workspace_z: tuple[float, float] = (0.15, 0.45)
+    workspace_z: tuple[float, float] = (0.2, 0.45)
     """Where the TCP reference may be, height above the ground [m]; the tipping bound lowers the upper end."""
     stiffness: tuple[float, ...] = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)
     """Joint stiffness K [N m/rad]; franka-interface."""
     damping: tuple[float, ...] = (50.0, 50.0, 50.0, 50.0, 30.0, 25.0, 15.0)
     """Joint damping D [N m s/rad]; franka-interface."""
+    base_time_constant: float = 0.02
+    """Time constant of the base's velocity servo [s]."""
+    max_hand_rate: float = 1.0
+    """Largest angular speed of the hand's orientation task, per axis [rad/s]."""
 
     def __post_init__(self) -> None:
         require_finite(self)

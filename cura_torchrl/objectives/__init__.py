@@ -1,1 +1,25 @@
+"""Loss and advantage of CURA-PPO, and the mathematics behind them."""
 
+from __future__ import annotations
+
+from cura_torchrl.objectives.cura import CURALoss
+from cura_torchrl.objectives.cura_advantage import CURAAdvantage
+from cura_torchrl.objectives.functional import (
+    energy_distance,
+    normalise,
+    risk_cost,
+    sr_lambda_targets,
+    standardise,
+    uncertainty_cost,
+)
+
+__all__ = [
+    "CURAAdvantage",
+    "CURALoss",
+    "energy_distance",
+    "normalise",
+    "risk_cost",
+    "sr_lambda_targets",
+    "standardise",
+    "uncertainty_cost",
+]

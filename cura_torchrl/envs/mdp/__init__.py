@@ -1,1 +1,1 @@
-
+"""The task itself as pure batched tensor functions, free of any simulator."""

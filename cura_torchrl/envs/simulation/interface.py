@@ -33,3 +33,23 @@ class WorldState:
     """Object's angular velocity [rad/s], shape ``[N, 3]``."""
     contact: torch.Tensor
     """Whether base, arm, object touched an obstacle during the last policy step, bool, shape ``[N, 3]``."""
+
+
+@dataclass
+class SceneState:
+    """How B worlds start, world frame."""
+
+    joint_position: torch.Tensor
+    """Joints (base x [m], y [m], yaw [rad], arm [rad]), shape ``[B, J]``."""
+    object_edge: torch.Tensor
+    """Edge of the pushed cube [m], shape ``[B]``."""
+    object_mass: torch.Tensor
+    """Its mass [kg], shape ``[B]``."""
+    floor_friction: torch.Tensor
+    """Coulomb friction between it and the floor [1], shape ``[B]``."""
+    com_offset: torch.Tensor
+    """Its centre of mass from its centre, object frame [m], shape ``[B, 3]``."""
+    object_pose: torch.Tensor
+    """Its centre (x [m], y [m], yaw [rad]), shape ``[B, 3]``."""
+    num_slots: int
+    """Most obstacles that may appear."""

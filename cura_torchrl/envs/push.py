@@ -1,0 +1,351 @@
+"""The pushing task as one natively batched TorchRL environment: N worlds in this process, partial resets, auto-reset by TorchRL."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from cura_torchrl import keys
+from cura_torchrl.envs.config import PushEnvConfig
+from cura_torchrl.envs.mdp import geometry, scenarios
+from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE, observe
+from cura_torchrl.envs.mdp.rewards import REWARD_TERM_NAMES, reward_terms
+from cura_torchrl.envs.mdp.terminations import endings, latch_success, success_flags
+from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots.controller import ImpedanceController
+from cura_torchrl.envs.sensors.lidar import Lidar
+from cura_torchrl.envs.simulation.bullet import BulletWorlds
+from cura_torchrl.envs.simulation.interface import SceneState, WorldState
+
+ACTION_SIZE = 6
+
+
+class PushEnv(EnvBase):
+    """Push a box to a goal with a mobile manipulator that sees through one planar LiDAR.
+
+    Every key it reads and writes is described in :mod:`cura_torchrl.keys`. A row plays the scenarios
+    ``first_episode + row``, then every ``episode_stride``-th: which scene an episode is never depends on batch size,
+    worker count or the order of resets.
+
+    Args:
+        num_envs: Number of worlds N.
+        config: Task, robot, LiDAR, physics.
+        seed: Seed of the scenarios and of the LiDAR's noise.
+        device: Device of the tensordicts; None casts nothing.
+        first_episode: Scenario of row 0's first episode.
+        episode_stride: Step from one scenario of a row to its next; N when None.
+        frames_done: Frames played before, which the curriculum goes on from.
+        frames_per_step: Frames that the curriculum counts for each step, all workers taken together; N when None.
+
+    Examples:
+        >>> env = PushEnv(2)
+        >>> rollout = env.rollout(3)
+        >>> rollout["next", "scan"].shape
+        torch.Size([2, 3, 360])
+        >>> env.close()
+    """
+
+    batch_locked = True
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        config: PushEnvConfig | None = None,
+        *,
+        seed: int = 0,
+        device: torch.device | str | None = None,
+        first_episode: int = 0,
+        episode_stride: int | None = None,
+        frames_done: int = 0,
+        frames_per_step: int | None = None,
+    ) -> None:
+        if num_envs < 1:
+            msg = f"num_envs is {num_envs}; accepted: 1 or more"
+            raise ValueError(msg)
+        super().__init__(device=device, batch_size=torch.Size([num_envs]))
+        self.config = PushEnvConfig() if config is None else config
+        self.num_envs = num_envs
+        self.frames_done = frames_done
+        self._frames_per_step = num_envs if frames_per_step is None else frames_per_step
+        self._stride = num_envs if episode_stride is None else episode_stride
+        self._next_episode = torch.arange(num_envs) + first_episode
+        self._is_first = torch.ones(num_envs, dtype=torch.bool)
+        self._ticks = round(self.config.task.policy_period / self.config.physics.control_period)
+        self._make_specs()
+        self._worlds = BulletWorlds(num_envs, model.URDF, model.BASE_JOINTS + model.ARM_JOINTS, self.config.physics)
+        self._controller = ImpedanceController(num_envs, self.config.robot, self.config.physics, self._ticks)
+        self._lidar = Lidar(num_envs, self.config.lidar, self._worlds.cast)
+        self._make_buffers()
+        self.set_seed(seed)
+
+    def _make_specs(self) -> None:
+        rows, rays = self.num_envs, self.config.lidar.num_rays
+
+        def real(*shape: int) -> Unbounded:
+            return Unbounded(shape=(rows, *shape), dtype=torch.float32)
+
+        def flag(size: int) -> Binary:
+            return Binary(n=size, shape=(rows, size), dtype=torch.bool)
+
+        def count() -> Unbounded:
+            return Unbounded(shape=(rows, 1), dtype=torch.int64)
+
+        self.observation_spec = Composite(
+            {
+                keys.OBSERVATION: real(OBSERVATION_SIZE),
+                keys.SCAN: Bounded(0.0, self.config.lidar.max_range, shape=(rows, rays), dtype=torch.float32),
+                keys.SENSOR_POSE: real(3),
+                keys.OBJECT_POSE: real(3),
+                keys.OBJECT_SIZE: real(2),
+                keys.REWARD_TERMS: real(len(REWARD_TERM_NAMES)),
+                keys.CONTACT: flag(3),
+                keys.SUCCESS: flag(len(self.config.task.tolerances)),
+                keys.TIPPED: flag(1),
+                keys.EPISODE: count(),
+                keys.ELAPSED_STEPS: count(),
+            },
+            shape=(rows,),
+        )
+        if self.config.task.privileged:
+            self.observation_spec[keys.OBSTACLES] = real(scenarios.OBSTACLE_SLOTS, 4)
+        self.action_spec = Bounded(-1.0, 1.0, shape=(rows, ACTION_SIZE), dtype=torch.float32)
+        self.full_reward_spec = Composite({keys.REWARD: real(1), keys.COST: real(1)}, shape=(rows,))
+        self.full_done_spec = Composite({"done": flag(1), "terminated": flag(1), "truncated": flag(1)}, shape=(rows,))
+
+    def _make_buffers(self) -> None:
+        rows, slots = self.num_envs, scenarios.OBSTACLE_SLOTS
+        self._obstacle_active = torch.zeros(rows, slots, dtype=torch.bool)
+        self._obstacle_pose = torch.zeros(rows, slots, 3, dtype=torch.float64)
+        self._elapsed = torch.zeros(rows, dtype=torch.int64)
+        self._age = torch.zeros(rows, dtype=torch.int64)
+        self._since_success = torch.full((rows,), -1, dtype=torch.int64)
+        self._success = torch.zeros(rows, len(self.config.task.tolerances), dtype=torch.bool)
+        self._tipped = torch.zeros(rows, dtype=torch.bool)
+        self._episode = torch.zeros(rows, dtype=torch.int64)
+        self._previous_action = torch.zeros(rows, ACTION_SIZE)
+        self._terms = torch.zeros(rows, len(REWARD_TERM_NAMES))
+        self._state: WorldState | None = None
+        self._scan = torch.zeros(rows, self.config.lidar.num_rays)
+        self.scenario = self._sample(torch.arange(rows))
+
+    @property
+    def world_state(self) -> WorldState:
+        """State of the worlds after the last step; reset first."""
+        if self._state is None:
+            msg = "the environment has not been reset; accepted: reset() before world_state"
+            raise RuntimeError(msg)
+        return self._state
+
+    @property
+    def obstacles(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Obstacles that have appeared: mask ``[N, 6]``, (x [m], y [m], yaw [rad]) ``[N, 6, 3]``, edge [m] ``[N, 6]``."""
+        return self._obstacle_active.clone(), self._obstacle_pose.clone(), self.scenario["obstacle_edge"].clone()
+
+    @property
+    def max_obstacles(self) -> int:
+        """Most obstacles K in an episode that starts now."""
+        curriculum = self.config.task.curriculum
+        reached = [most for frames, most in curriculum if frames <= self.frames_done]
+        if not curriculum:
+            return self.config.task.scenario.max_obstacles
+        return reached[-1] if reached else 0
+
+    def _sample(self, episodes: torch.Tensor) -> TensorDict:
+        task = self.config.task
+        return scenarios.sample_scenarios(
+            task.scenario, stream=task.stream, seed=getattr(self, "_scenario_seed", 0), episodes=episodes,
+            max_obstacles=self.max_obstacles, tcp_reach=model.HOME_TCP[0],
+        )  # fmt: skip
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._scenario_seed = 0 if seed is None else int(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, *, episodes: torch.Tensor | None = None, **_: Any) -> TensorDict:
+        """Reset the rows of the mask, or all.
+
+        Args:
+            tensordict: May hold the mask ``_reset``.
+            episodes: Scenarios to play, int64, shape ``[N]``; each row's next one when left out.
+        """
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        rows = torch.arange(self.num_envs) if mask is None else mask.reshape(self.num_envs).nonzero().flatten()
+        self._episode[rows] = self._next_episode[rows] if episodes is None else episodes.reshape(-1)[rows]
+        self._next_episode[rows] = self._episode[rows] + self._stride
+        self.scenario[rows] = self._sample(self._episode[rows])
+        self._clear(rows)
+        self._build(rows)
+        self._spawn()
+        self._measure(rows)
+        return self._emit()
+
+    def _clear(self, rows: torch.Tensor) -> None:
+        self._obstacle_active[rows] = False
+        self._obstacle_pose[rows] = 0.0
+        self._elapsed[rows] = 0
+        self._since_success[rows] = -1
+        self._success[rows] = False
+        self._tipped[rows] = False
+        self._previous_action[rows] = 0.0
+        self._terms[rows] = 0.0
+        self._age[rows] = 0
+        first = rows[self._is_first[rows]]
+        if self.config.task.random_first_age and len(first):
+            # Spread by the golden ratio: even over any number of rows, and no draw to keep.
+            share = (self._episode[first].double() * 0.6180339887498949) % 1.0
+            self._age[first] = (share * self._limit).long()
+        self._is_first[rows] = False
+
+    @property
+    def _limit(self) -> int:
+        return round(self.config.task.episode_time / self.config.task.policy_period)
+
+    def _build(self, rows: torch.Tensor) -> None:
+        scene = self.scenario[rows]
+        task, edge = self.config.task.scenario, scene["object_edge"]
+        arm = torch.tensor(model.HOME, dtype=torch.float64).expand(len(rows), -1)
+        start = SceneState(
+            joint_position=torch.cat([scene["robot_pose"], arm], dim=-1),
+            object_edge=edge,
+            object_mass=scene["object_mass"],
+            floor_friction=scene["floor_friction"],
+            com_offset=scene["com_offset"],
+            object_pose=scene["object_pose"],
+            num_slots=scenarios.OBSTACLE_SLOTS,
+        )
+        self._worlds.reset(rows, start)
+        # Pushing higher than (edge / 2 - CoM shift) / mu would tip the object; 0.9 is the margin.
+        self._controller.reset(rows, 0.9 * edge * (0.5 - task.com_shift) / task.floor_friction[1])
+        seed = self._scenario_seed & 0xFFFFFFFFFFFFFFFF
+        stream = ("train", "eval", "vae").index(self.config.task.stream)
+        self._lidar.reset(rows.tolist(), [(stream, seed, int(self._episode[row])) for row in rows])
+
+    def _spawn(self) -> None:
+        state = self._worlds.state()
+        tcp, _, _ = self._controller.kinematics.forward(state.joint_position)
+        active, pose = scenarios.spawn_obstacles(
+            self.config.task.scenario, self.scenario, self._obstacle_active, self._obstacle_pose,
+            time=self._elapsed.double() * self.config.task.policy_period, base_pose=state.base_pose,
+            tcp_position=geometry.from_frame(state.base_pose, tcp[:, :2]), object_pose=_planar(state),
+        )  # fmt: skip
+        for row, slot in (active & ~self._obstacle_active).nonzero().tolist():
+            x, y, yaw = pose[row, slot].tolist()
+            self._worlds.place_obstacle(row, slot, (x, y, yaw), self.scenario["obstacle_edge"][row, slot].item())
+        self._obstacle_active, self._obstacle_pose = active, pose
+
+    def _measure(self, rows: torch.Tensor) -> None:
+        """Read the state of all worlds and the scans of the given ones."""
+        self._state = state = self._worlds.state()
+        edge = torch.where(self._obstacle_active, self.scenario["obstacle_edge"], 0.0)
+        bodies = torch.cat([self._obstacle_pose, _planar(state)[:, None]], dim=1)
+        seen = self.scenario["object_edge"] if self.config.lidar.occlusion else torch.zeros(self.num_envs, dtype=torch.float64)
+        edges = torch.cat([edge, seen[:, None]], dim=1)
+        # A fresh tensor: what was emitted before must not change.
+        scan = self._scan.clone()
+        scan[rows] = self._lidar.scan(rows.tolist(), state.base_pose[rows], bodies[rows], edges[rows])
+        self._scan = scan
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        action = tensordict[keys.ACTION].detach().cpu().clamp(-1.0, 1.0)
+        if not bool(torch.isfinite(action).all()):
+            msg = f"action has values that are not finite in rows {(~action.isfinite().all(-1)).nonzero().flatten().tolist()}"
+            raise ValueError(msg)
+        before = self.world_state
+        to_object = geometry.to_frame(before.base_pose, before.object_position[:, :2])
+        self._controller.command(action, to_object, self._worlds.mass_matrix())
+        self._worlds.advance(self._controller, self._ticks)
+        self.frames_done += self._frames_per_step
+        self._elapsed = self._elapsed + 1
+        self._spawn()
+        self._measure(torch.arange(self.num_envs))
+        cost, reward = self._judge(action, before)
+        terminated, truncated = endings(
+            self.config.task, contact=self.world_state.contact, elapsed_steps=self._elapsed + self._age, steps_since_success=self._since_success
+        )  # fmt: skip
+        self._previous_action = action.float()
+        ends = {"terminated": terminated[:, None], "truncated": truncated[:, None], "done": (terminated | truncated)[:, None]}
+        return self._emit().update({keys.REWARD: reward, keys.COST: cost, **ends})
+
+    def _judge(self, action: torch.Tensor, before: WorldState) -> tuple[torch.Tensor, torch.Tensor]:
+        """Update success and tipping; return cost and reward, shape ``[N, 1]`` each."""
+        state, scene, task = self.world_state, self.scenario, self.config.task
+        flags = success_flags(task, _planar(state), scene["goal_pose"])
+        self._success, self._since_success = latch_success(self._success, self._since_success, flags=flags, contact=state.contact)
+        self._tipped = self._tipped | (geometry.tilt_from_quaternion(state.object_quaternion) > task.tilt_limit)
+        goal = torch.cat([scene["goal_pose"][:, :2], scene["object_edge"][:, None] / 2], dim=-1)
+        tcp, _, _ = self._controller.kinematics.forward(state.joint_position)
+        tcp_w = torch.cat([geometry.from_frame(state.base_pose, tcp[:, :2]), tcp[:, 2:]], dim=-1)
+        terms = reward_terms(
+            task.reward,
+            object_corners=geometry.cube_corners(state.object_position, state.object_quaternion, scene["object_edge"]),
+            goal_corners=geometry.cube_corners(goal, geometry.quaternion_from_yaw(scene["goal_pose"][:, 2]), scene["object_edge"]),
+            object_velocity=state.object_velocity[:, :2],
+            object_position=state.object_position[:, :2],
+            goal_position=goal[:, :2],
+            surface_point_w=geometry.transform_point(state.object_position, state.object_quaternion, scene["surface_point"]),
+            tcp_position=tcp_w,
+            action=action.double(),
+            previous_action=self._previous_action.double(),
+            joint_acceleration=(state.joint_velocity - before.joint_velocity) / task.policy_period,
+        )
+        self._terms = terms.float()
+        return state.contact.any(-1, keepdim=True).float(), self._terms.sum(-1, keepdim=True)
+
+    def _emit(self) -> TensorDict:
+        """Return every observation as fresh tensors."""
+        state, scene = self.world_state, self.scenario
+        tcp, rotation, jacobian = self._controller.kinematics.forward(state.joint_position)
+        pose = _planar(state)
+        out = {
+            keys.OBSERVATION: observe(
+                base_pose=state.base_pose,
+                base_velocity=state.base_velocity,
+                tcp_position_b=tcp,
+                hand_rotation_b=rotation,
+                tcp_velocity_b=self._tcp_velocity(tcp, jacobian),
+                previous_action=self._previous_action,
+                object_position=state.object_position,
+                object_yaw=pose[:, 2],
+                object_velocity=state.object_velocity,
+                object_yaw_rate=state.object_angular_velocity[:, 2],
+                goal_pose=scene["goal_pose"],
+            ),
+            keys.SCAN: self._scan.clone(),
+            keys.SENSOR_POSE: state.base_pose.float(),
+            keys.OBJECT_POSE: pose.float(),
+            keys.OBJECT_SIZE: scene["object_edge"].float()[:, None].repeat(1, 2),
+            keys.REWARD_TERMS: self._terms.clone(),
+            keys.CONTACT: state.contact.clone(),
+            keys.SUCCESS: self._success.clone(),
+            keys.TIPPED: self._tipped[:, None].clone(),
+            keys.EPISODE: self._episode[:, None].clone(),
+            keys.ELAPSED_STEPS: self._elapsed[:, None].clone(),
+        }
+        if self.config.task.privileged:
+            edge = torch.where(self._obstacle_active, scene["obstacle_edge"], 0.0)
+            out[keys.OBSTACLES] = torch.cat([self._obstacle_pose, edge[..., None]], dim=-1).float()
+        emitted = TensorDict(out, batch_size=self.batch_size)
+        return emitted if self.device is None else emitted.to(self.device)
+
+    def _tcp_velocity(self, tcp: torch.Tensor, jacobian: torch.Tensor) -> torch.Tensor:
+        """Velocity of the TCP relative to the world, in the base frame [m/s], shape ``[N, 3]``."""
+        state = self.world_state
+        base = geometry.rotate(state.base_velocity[:, :2], -state.base_pose[:, 2])
+        spin = state.base_velocity[:, 2]
+        arm = (jacobian[:, :3] @ state.joint_velocity[:, :, None])[:, :, 0]
+        moved = torch.stack([base[:, 0] - spin * tcp[:, 1], base[:, 1] + spin * tcp[:, 0], torch.zeros_like(spin)], dim=-1)
+        return arm + moved
+
+    def close(self, *, raise_if_closed: bool = False) -> None:
+        """Disconnect the simulator; harmless when done twice."""
+        self._worlds.close()
+        if not self.is_closed:
+            super().close(raise_if_closed=raise_if_closed)
+
+
+def _planar(state: WorldState) -> torch.Tensor:
+    """Object's (x [m], y [m], yaw [rad]), shape ``[N, 3]``."""
+    return torch.cat([state.object_position[:, :2], geometry.yaw_from_quaternion(state.object_quaternion)[:, None]], dim=-1)

@@ -1,0 +1,178 @@
+"""From policy action to joint torques: velocity ramps, differential IK on the joint reference, 200 Hz joint impedance.
+
+The reference lives in joint space and integrates the commanded end-effector velocity. Where it may be is bounded by the
+TCP's workspace, by the joint limits, and by the torque that it can ask for.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from cura_torchrl.envs.config import PhysicsConfig, RobotConfig
+from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots.kinematics import ArmKinematics, damped_least_squares
+
+BASE_DOF = len(model.BASE_JOINTS)
+
+
+class ImpedanceController:
+    """Joint references and torques of N robots. State: base velocity command and joint reference of each.
+
+    Args:
+        num_worlds: Number of robots N.
+        robot: Limits and gains.
+        physics: Clock.
+        ticks: Control ticks in a policy step.
+    """
+
+    def __init__(self, num_worlds: int, robot: RobotConfig, physics: PhysicsConfig, ticks: int) -> None:
+        self.config = robot
+        self.kinematics = ArmKinematics()
+        self.period = physics.control_period
+        self.ik_ticks = max(1, round(1.0 / (robot.ik_rate * self.period)))
+        self.ticks = ticks
+        self._home = torch.tensor(model.HOME, dtype=torch.float64)
+        self._stiffness = np.array(robot.stiffness)
+        base_damping = np.array([model.BASE_MASS, model.BASE_MASS, model.BASE_YAW_INERTIA]) / robot.base_time_constant
+        self._damping = np.concatenate([base_damping, robot.damping])
+        self._torque_limit = np.array(model.TORQUE_LIMIT)
+        # The spring, less what the damper takes, may ask for no more than the joint has: else the reference runs away.
+        self._reach = self._torque_limit / self._stiffness
+        self._lag = np.array(robot.damping) / self._stiffness
+        self._lower, self._upper = np.array(model.JOINT_LOWER), np.array(model.JOINT_UPPER)
+        self._speed = np.array(model.VELOCITY_LIMIT)
+        self._ramp = self.period * np.array([robot.max_base_acceleration] * 2 + [robot.max_base_yaw_acceleration])
+        self.reference = np.tile(np.array(model.HOME), (num_worlds, 1))
+        self.base_command = np.zeros((num_worlds, BASE_DOF))
+        self._base_target = np.zeros((num_worlds, BASE_DOF))
+        self._tcp_target = np.zeros((num_worlds, 3))
+        self.tcp_reference = np.tile(np.array(model.HOME_TCP), (num_worlds, 1))
+        self._height_limit = np.full(num_worlds, robot.workspace_z[1])
+        self._object_xy_b = np.tile(np.array([[2.0, 0.0]]), (num_worlds, 1))
+        self._gain = np.zeros((num_worlds, BASE_DOF + 7, BASE_DOF + 7))
+        self._rate = np.zeros((num_worlds, 7))
+
+    def reset(self, rows: torch.Tensor, height_limit: torch.Tensor) -> None:
+        """Put robots at rest in the home posture.
+
+        Args:
+            rows: Indices of the robots, shape ``[B]``.
+            height_limit: Highest TCP reference that does not tip the object [m], shape ``[B]``.
+        """
+        index = rows.numpy()
+        self.reference[index] = np.array(model.HOME)
+        self.tcp_reference[index] = np.array(model.HOME_TCP)
+        self.base_command[index] = 0.0
+        self._height_limit[index] = np.minimum(height_limit.numpy(), self.config.workspace_z[1])
+
+    def command(self, action: torch.Tensor, object_xy_b: torch.Tensor, mass_matrix: np.ndarray) -> None:
+        """Take the action of a policy step.
+
+        Args:
+            action: Base (vx, vy, wz) and end-effector (vx, vy, vz) as shares of their maxima, shape ``[N, 6]``.
+            object_xy_b: Object's centre in the base frame, which the hand turns to [m], shape ``[N, 2]``.
+            mass_matrix: Joint-space inertia, kept for the policy step [kg, kg m^2], shape ``[N, 10, 10]``.
+        """
+        config = self.config
+        shares = action.double().clamp(-1.0, 1.0).numpy()
+        norm = np.maximum(np.sqrt(shares[:, 0:1] ** 2 + shares[:, 1:2] ** 2), 1.0)
+        self._base_target[:, :2] = shares[:, :2] / norm * config.max_base_speed
+        self._base_target[:, 2] = shares[:, 2] * config.max_base_yaw_rate
+        self._tcp_target = shares[:, 3:6] * config.max_tcp_speed
+        self._object_xy_b = object_xy_b.numpy().copy()
+        # tau = M (M + D dt + K dt^2)^-1 (...): the implicit (stable) form of the impedance law.
+        implicit = mass_matrix.copy()
+        diagonal = np.arange(BASE_DOF + 7)
+        implicit[:, diagonal, diagonal] += self._damping * self.period
+        arm = diagonal[BASE_DOF:]
+        implicit[:, arm, arm] += self._stiffness * self.period**2
+        self._gain = mass_matrix @ np.linalg.inv(implicit)
+
+    def torques(self, tick: int, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Return the joint torques of one tick.
+
+        Args:
+            tick: Tick within the policy step; the differential IK is solved in every ``ik_ticks``-th.
+            position: Joints (base x [m], y [m], yaw [rad], arm [rad]), shape ``[N, 10]``.
+            velocity: Their velocities, shape ``[N, 10]``.
+
+        Returns:
+            Forces and torques [N, N, N m, N m ...], shape ``[N, 10]``.
+
+        Source:
+            Tan, Liu and Turk (2011), "Stable proportional-derivative controllers", eq. (11).
+        """
+        if tick % self.ik_ticks == 0:
+            self._solve_ik()
+        arm_position, arm_velocity = position[:, BASE_DOF:], velocity[:, BASE_DOF:]
+        self.reference += self._rate * self.period
+        np.clip(self.reference, self._lower, self._upper, out=self.reference)
+        centre = arm_position + self._lag * arm_velocity
+        np.clip(self.reference, centre - self._reach, centre + self._reach, out=self.reference)
+        self.base_command += np.clip(self._base_target - self.base_command, -self._ramp, self._ramp)
+        force = np.empty_like(position)
+        force[:, :BASE_DOF] = self._damping[:BASE_DOF] * (_to_world(self.base_command, position[:, 2]) - velocity[:, :BASE_DOF])
+        error = self.reference - arm_position - self.period * arm_velocity
+        force[:, BASE_DOF:] = self._stiffness * error - self._damping[BASE_DOF:] * arm_velocity
+        torque = (self._gain @ force[:, :, None])[:, :, 0]
+        torque[:, BASE_DOF:] = np.clip(torque[:, BASE_DOF:], -self._torque_limit, self._torque_limit)
+        return torque
+
+    def _solve_ik(self) -> None:
+        reference = torch.from_numpy(self.reference.copy())
+        tcp, rotation, jacobian = self.kinematics.forward(reference)
+        twist = torch.cat([self._linear(tcp), self._angular(tcp, rotation)], dim=-1)
+        rate, free = damped_least_squares(jacobian, twist, self.config.ik_damping)
+        posture = self.config.posture_gain * (self._home - reference)
+        rate = rate + (free @ posture[:, :, None])[:, :, 0]
+        self._rate = np.clip(rate.numpy(), -self._speed, self._speed)
+
+    def _linear(self, tcp: torch.Tensor) -> torch.Tensor:
+        """Velocity that moves the TCP's reference as commanded, within the workspace, and follows it [m/s]."""
+        config, horizon = self.config, self.ik_ticks * self.period
+        bounds = np.array([config.workspace_x, config.workspace_y, config.workspace_z])
+        upper = np.tile(bounds[:, 1], (len(tcp), 1))
+        upper[:, 2] = self._height_limit
+        at, before = tcp.numpy(), self.tcp_reference
+        after = np.clip(before + horizon * self._tcp_target, bounds[:, 0], upper)
+        # Not further from where the joints' reference can be than the leash: it must not wind up against a blocked object.
+        after = np.clip(after, at - config.tcp_leash, at + config.tcp_leash)
+        self.tcp_reference = after
+        follow = (after - before) / horizon + config.position_gain * (after - at)
+        return torch.from_numpy(np.clip(follow, -2.0 * config.max_tcp_speed, 2.0 * config.max_tcp_speed))
+
+    def _angular(self, tcp: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
+        """Angular velocity that turns the hand's axis towards the object's centre, within limits [rad/s]."""
+        config = self.config
+        offset = torch.from_numpy(self._object_xy_b) - tcp[:, :2]
+        yaw = torch.atan2(offset[:, 1], offset[:, 0].clamp_min(1e-3)).clamp(-config.max_hand_yaw, config.max_hand_yaw)
+        target = hand_rotation(yaw, config.hand_tilt)
+        # Sum of the cross products of the axes: twice the rotation vector to first order.
+        error = 0.5 * torch.cross(rotation.mT, target.mT, dim=-1).sum(-2)
+        return (config.orientation_gain * error).clamp(-config.max_hand_rate, config.max_hand_rate)
+
+
+def hand_rotation(yaw: torch.Tensor, tilt: float) -> torch.Tensor:
+    """Return the hand's rotation for an axis that points forward and down, fingers side by side.
+
+    Args:
+        yaw: Angle of the hand's axis from the base's x axis in the plane [rad], shape ``[N]``.
+        tilt: Angle of the axis below the horizontal [rad].
+
+    Returns:
+        Rotation matrices whose third column is the hand's axis, shape ``[N, 3, 3]``.
+
+    Examples:
+        >>> hand_rotation(torch.zeros(1), 0.0)[0, :, 2].tolist()
+        [1.0, 0.0, 0.0]
+    """
+    zero, pitch = torch.zeros_like(yaw), torch.full_like(yaw, tilt)
+    axis = torch.stack([pitch.cos() * yaw.cos(), pitch.cos() * yaw.sin(), -pitch.sin()], dim=-1)
+    fingers = torch.stack([yaw.sin(), -yaw.cos(), zero], dim=-1)
+    return torch.stack([torch.cross(fingers, axis, dim=-1), fingers, axis], dim=-1)
+
+
+def _to_world(twist: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.stack([cos * twist[:, 0] - sin * twist[:, 1], sin * twist[:, 0] + cos * twist[:, 1], twist[:, 2]], axis=-1)

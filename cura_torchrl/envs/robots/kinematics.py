@@ -1,0 +1,67 @@
+"""Forward kinematics, Jacobian and damped least squares of the arm, batched over worlds (pytorch-kinematics)."""
+
+from __future__ import annotations
+
+import pytorch_kinematics as pk
+import torch
+
+from cura_torchrl.envs.robots.ridgeback_franka import BASE_LINK, BASE_LINK_HEIGHT, TCP_LINK, URDF
+
+
+class ArmKinematics:
+    """Pose and Jacobian of the TCP in the base frame (on the ground below the base's centre).
+
+    Examples:
+        >>> arm = ArmKinematics()
+        >>> position, rotation, jacobian = arm.forward(torch.zeros(2, 7, dtype=torch.float64))
+        >>> position.shape, rotation.shape, jacobian.shape
+        (torch.Size([2, 3]), torch.Size([2, 3, 3]), torch.Size([2, 6, 7]))
+    """
+
+    def __init__(self) -> None:
+        self._chain = pk.build_serial_chain_from_urdf(URDF.read_bytes(), TCP_LINK, root_link_name=BASE_LINK).to(dtype=torch.float64)
+
+    def forward(self, joint_position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return where the TCP is and how it moves with the joints.
+
+        Args:
+            joint_position: Arm joints [rad], float64, shape ``[N, 7]``.
+
+        Returns:
+            TCP position [m], shape ``[N, 3]``; its rotation matrix, shape ``[N, 3, 3]``; the Jacobian of linear, then
+            angular velocity [m/rad, 1], shape ``[N, 6, 7]``; all in the base frame.
+        """
+        jacobian, pose = self._chain.jacobian(joint_position, ret_eef_pose=True)
+        position = pose[:, :3, 3].clone()
+        position[:, 2] += BASE_LINK_HEIGHT
+        return position, pose[:, :3, :3], jacobian
+
+
+def damped_least_squares(jacobian: torch.Tensor, twist: torch.Tensor, damping: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the joint velocity that follows a twist, and the projector onto what is left free.
+
+    The solution is ``J^T (J J^T + damping^2 I)^-1 twist``.
+
+    Args:
+        jacobian: Jacobian of the task, shape ``[N, 6, 7]``.
+        twist: Linear [m/s] and angular [rad/s] velocity, shape ``[N, 6]``.
+        damping: Damping factor lambda.
+
+    Returns:
+        Joint velocity [rad/s], shape ``[N, 7]``; null-space projector ``I - J^+ J``, shape ``[N, 7, 7]``.
+
+    Source:
+        Paper, implementation details (DLS, lambda = 0.02).
+
+    Examples:
+        >>> jacobian = torch.eye(7, dtype=torch.float64)[None, :6]
+        >>> velocity, free = damped_least_squares(jacobian, torch.ones(1, 6, dtype=torch.float64), 0.0)
+        >>> velocity[0, :2].tolist(), free[0, 6, 6].item()
+        ([1.0, 1.0], 1.0)
+    """
+    rows, joints = jacobian.shape[-2:]
+    transposed = jacobian.mT
+    gram = jacobian @ transposed + damping**2 * torch.eye(rows, dtype=jacobian.dtype)
+    inverse = torch.linalg.solve(gram, jacobian).mT  # J^T (J J^T + lambda^2 I)^-1, the Gram matrix being symmetric
+    velocity = (inverse @ twist[..., None])[..., 0]
+    return velocity, torch.eye(joints, dtype=jacobian.dtype) - inverse @ jacobian

@@ -1,0 +1,80 @@
+"""Pushers without learning: proof that physics, kinematics and control can do the job, and a reference to compare with."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from cura_torchrl import keys
+from cura_torchrl.envs.config import RobotConfig
+from cura_torchrl.envs.mdp import geometry
+from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
+
+
+class ScriptedPusher(TensorDictModuleBase):
+    """Go behind the object, push it towards the goal, correct sideways.
+
+    Reads ``observation``, writes ``action``; usable wherever a policy is. It looks only at robot, object and goal.
+
+    Args:
+        robot: Limits that actions are shares of.
+        speed: Pushing speed [m/s].
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> policy = ScriptedPusher()
+        >>> policy(TensorDict({"observation": torch.zeros(2, 33)}, [2]))["action"].shape
+        torch.Size([2, 6])
+    """
+
+    def __init__(self, robot: RobotConfig | None = None, *, speed: float = 0.6) -> None:
+        super().__init__()
+        self.in_keys = [keys.OBSERVATION]
+        self.out_keys = [keys.ACTION]
+        self.robot = RobotConfig() if robot is None else robot
+        self.speed = speed
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action for every row."""
+        parts = {name: tensordict[keys.OBSERVATION][..., part] for name, part in OBSERVATION_SLICES.items()}
+        waypoint = self._waypoint(tensordict, parts)
+        tensordict[keys.ACTION] = self._action(parts, waypoint)
+        return tensordict
+
+    def _waypoint(self, tensordict: TensorDictBase, parts: dict[str, torch.Tensor]) -> torch.Tensor:  # noqa: ARG002
+        """Where the object should go next, base frame [m], shape ``[*, 2]``."""
+        return parts["goal_position"]
+
+    def _action(self, parts: dict[str, torch.Tensor], waypoint: torch.Tensor) -> torch.Tensor:
+        tcp, centre, half = parts["tcp_position"][..., :2], parts["object_position"][..., :2], parts["object_position"][..., 2:]
+        to_goal = waypoint - centre
+        distance = to_goal.norm(dim=-1, keepdim=True)
+        along = to_goal / distance.clamp_min(1e-6)
+        across = torch.stack([-along[..., 1], along[..., 0]], dim=-1)
+        offset = centre - tcp
+        ahead, aside = (offset * along).sum(-1, keepdim=True), (offset * across).sum(-1, keepdim=True)
+        turn = torch.atan2(along[..., 1], along[..., 0])[..., None]
+        # Behind the object the hand closes in; beside it, it first falls back to where it can come round.
+        standoff = 1.25 * half + 0.1
+        behind = (ahead > 0.75 * half) & (aside.abs() < 0.8 * half)
+        sideways = (2.0 * aside).clamp(-0.35, 0.35)
+        centred = (1.0 - aside.abs() / (0.5 * half + 1e-6)).clamp(0.15, 1.0)
+        gap = (ahead - half).clamp_min(0.0)
+        forward = torch.minimum(torch.full_like(distance, self.speed), 0.12 + 1.2 * distance) * centred
+        forward = torch.where(gap > 0.15, torch.minimum(forward, 0.2 + gap), forward)
+        retreat = (1.5 * (ahead - standoff)).clamp(-0.6, 0.3)
+        velocity = torch.where(behind, forward, retreat) * along + torch.where(behind, sideways, 2.0 * sideways) * across
+        velocity = torch.where(distance < 0.03, torch.zeros_like(velocity), velocity)
+        return self._share(tcp, velocity, turn)
+
+    def _share(self, tcp: torch.Tensor, velocity: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
+        """Split a TCP velocity between base and arm: the base carries it, the arm returns to its middle."""
+        spin = (1.2 * turn).clamp(-0.6, 0.6)
+        home = tcp.new_tensor([0.9, 0.0])
+        arm = (1.0 * (home - tcp)).clamp(-0.2, 0.2)
+        carried = torch.cat([-spin * tcp[..., 1:], spin * tcp[..., :1]], dim=-1)
+        base = (velocity - carried - arm) / self.robot.max_base_speed
+        base = base / base.norm(dim=-1, keepdim=True).clamp_min(1.0)
+        lift = torch.zeros_like(turn)
+        return torch.cat([base, spin / self.robot.max_base_yaw_rate, arm / self.robot.max_tcp_speed, lift], dim=-1)

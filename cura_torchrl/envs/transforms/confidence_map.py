@@ -1,0 +1,268 @@
+"""The confidence map: what the LiDAR has seen of the world and how long ago, in a window around the robot.
+
+The global map lives in buffers of the transform, indexed with the reset mask, and never enters a tensordict: at 1024
+environments and 24 steps even the window would fill gigabytes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase, unravel_key
+from torchrl.data import Bounded, Composite
+from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms.utils import _get_reset
+
+from cura_torchrl import keys
+from cura_torchrl.envs.config import MapConfig, require
+from cura_torchrl.envs.sensors import visibility
+from cura_torchrl.envs.sensors.visibility import MapGrid
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tensordict import NestedKey
+
+_CHUNK_CELLS = 2**18
+"""Cells processed at once: bounds the temporaries' memory and keeps them near the cache."""
+
+_MAX_AGE = 2**16
+"""Age [steps] at which a cell stops decaying."""
+
+
+class ConfidenceMap(Transform):
+    """Keep a map of what the LiDAR has seen and write the window around the robot.
+
+    Each cell has a confidence, 1 when observed in this step and else ``decay`` times the last one (paper Eq. (2)), and an
+    occupancy in {0, 1}: what was there when it was last observed, which does not decay. A cell is observed free if its
+    centre is nearer than the range measured at its bearing, less half a cell's diagonal; the cell in which a ray ends on
+    something is observed occupied; all other cells are unseen in this step, and before their first observation both
+    values are 0. The cells of the robot and of the known object are left out of the occupancy: rays that end on the
+    object (or within a cell of its sides, for noise and for the grid) mark the cell as seen without an obstacle, and
+    inside of both footprints the window shows none.
+
+    The window ``[*, C, W, W]`` turns with the base: row ``i`` lies at base-frame ``x = (i - (W - 1) / 2) * resolution``
+    (ahead of the robot for large ``i``), column ``j`` at base-frame ``y = (j - (W - 1) / 2) * resolution`` (to its left
+    for large ``j``); each takes the map cell that its centre lies in. Outside of the map's extent everything is unseen.
+
+    ====================== ======= ============================================================ ==================
+    Key (default)          Access  Content                                                      Shape
+    ====================== ======= ============================================================ ==================
+    ``scan``               read    Ranges [m]; see :func:`~cura_torchrl.envs.sensors.ray_bearings` ``[*, R]``
+    ``sensor_pose``        read    Sensor (x [m], y [m], yaw [rad]), world frame                ``[*, 3]``
+    ``object_pose``        read    Object's centre (x [m], y [m], yaw [rad]), world frame       ``[*, 3]``
+    ``object_size``        read    Object's footprint (length, width) [m]                       ``[*, 2]``
+    ``confidence_map``     write   Window of the map [1]; channels as in ``config.channels``    ``[*, C, W, W]``
+    ====================== ======= ============================================================ ==================
+
+    A reset forgets the rows that are reset and integrates their first scan; in the other rows the window that ``_reset``
+    returns is 0, for TorchRL keeps their old value. Rows never depend on one another. A range that is not a number has
+    seen nothing. Called as a module, outside of an environment, the transform integrates one more scan; it is no
+    transform for a replay buffer, whose samples are in no order. The time of a step grows with the cells of the extent.
+
+    Args:
+        config: Decay, extent, window and channels.
+        num_rays: Rays per turn [1].
+        max_range: Largest range, and what a miss reads [m].
+        robot_size: Robot's footprint (length, width), a rectangle around the sensor [m].
+        in_keys: Keys of the scan and of the sensor's pose.
+        object_keys: Keys of the object's pose and footprint; None if there is no known object.
+        out_key: Key of the window.
+
+    Raises:
+        ValueError: If ``in_keys`` or ``object_keys`` are not pairs, or a number is out of range.
+
+    Source:
+        Paper Eq. (2) and section "Sensor Encoding"; footprint of the Ridgeback: ridgeback_description.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> transform = ConfidenceMap(MapConfig(window=4), num_rays=8, max_range=10.0, object_keys=None)
+        >>> data = TensorDict(scan=torch.full((2, 8), 5.0), sensor_pose=torch.zeros(2, 3), batch_size=[2])
+        >>> transform(data)["confidence_map"].shape
+        torch.Size([2, 2, 4, 4])
+        >>> transform(data)["confidence_map"][:, 0].unique().tolist()
+        [1.0]
+    """
+
+    def __init__(
+        self,
+        config: MapConfig | None = None,
+        *,
+        num_rays: int,
+        max_range: float,
+        robot_size: tuple[float, float] = (0.960, 0.793),
+        in_keys: Sequence[NestedKey] = (keys.SCAN, keys.SENSOR_POSE),
+        object_keys: Sequence[NestedKey] | None = (keys.OBJECT_POSE, keys.OBJECT_SIZE),
+        out_key: NestedKey = keys.CONFIDENCE_MAP,
+    ) -> None:
+        require(len(in_keys) == 2, "in_keys", in_keys, "the keys of the scan and of the sensor's pose")
+        require(object_keys is None or len(object_keys) == 2, "object_keys", object_keys, "None, or two keys: pose and size")
+        require(num_rays >= 1 and max_range > 0, "num_rays, max_range", (num_rays, max_range), "positive numbers")
+        super().__init__(in_keys=[*in_keys, *(object_keys or ())], out_keys=[out_key])
+        self.config = config = MapConfig() if config is None else config
+        self.num_rays = num_rays
+        self.max_range = max_range
+        self.grid = MapGrid(extent_x=config.extent_x, extent_y=config.extent_y, resolution=config.resolution)
+        offsets = visibility.window_offsets(config.window, config.resolution)
+        bearings = visibility.ray_bearings(num_rays)
+        origin = torch.zeros(1, 3)
+        tables = {
+            "_row_x": self.grid.row_x(),
+            "_column_y": self.grid.column_y(),
+            "_offsets": offsets,
+            "_directions": torch.stack(visibility.unit_vector(bearings)),
+            "_powers": _decay_powers(config.decay),
+            "_robot_size": torch.tensor(robot_size),
+            "_outside_robot": visibility.outside_footprint(offsets, origin, origin, torch.tensor(robot_size)).flatten(1),
+        }
+        for name, table in tables.items():
+            self.register_buffer(name, table, persistent=False)
+        # +t: seen free in step t of the episode; -t: seen occupied in step t; 0: never seen. Whole numbers, exact below 2**24.
+        self.register_buffer("_stamps", None, persistent=False)
+        self.register_buffer("_steps", None, persistent=False)
+        self._batch_shape = torch.Size([])
+
+    @property
+    def num_channels(self) -> int:
+        """Channels of the window."""
+        return 2 if self.config.channels == "confidence+occupancy" else 1
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Integrate one more scan and write the window.
+
+        Args:
+            tensordict: Holds the in_keys; modified in place.
+
+        Returns:
+            The same tensordict.
+        """
+        if self._stamps is None:
+            return self._reset(tensordict.empty(), tensordict)
+        return self._call(tensordict)
+
+    @torch.no_grad()
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        inputs = self._read(next_tensordict)
+        num_rows = inputs[0].shape[0]
+        if self._stamps is None or self._stamps.shape[0] != num_rows:
+            known = "no map yet" if self._stamps is None else f"a map for batch {list(self._batch_shape)}"
+            msg = f"step with {num_rows} rows, but there is {known}; accepted: the batch of the last whole reset"
+            raise ValueError(msg)
+        return self._write(next_tensordict, self._observe(self._stamps, self._steps, inputs))
+
+    @torch.no_grad()
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        inputs = self._read(tensordict_reset)
+        num_rows, device = inputs[0].shape[0], inputs[0].device
+        mask = _get_reset(self._reset_key(), tensordict).expand(self._batch_shape).reshape(-1)
+        if self._stamps is None or self._stamps.shape[0] != num_rows or self._stamps.device != device:
+            require(bool(mask.all()), "reset mask", mask.tolist(), "a whole reset where the batch or the device is new")
+            self._stamps = torch.zeros(num_rows, self.grid.num_rows, self.grid.num_columns, device=device)
+            self._steps = torch.zeros(num_rows, device=device)
+        rows = mask.nonzero().squeeze(-1)
+        stamps = self._stamps.new_zeros(rows.numel(), *self._stamps.shape[1:])
+        steps = self._steps.new_zeros(rows.numel())
+        fresh = self._observe(stamps, steps, [item[rows] for item in inputs])
+        self._stamps[rows], self._steps[rows] = stamps, steps
+        window = fresh.new_zeros(num_rows, *fresh.shape[1:])
+        window[rows] = fresh
+        return self._write(tensordict_reset, window)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the window's spec.
+
+        Args:
+            observation_spec: Spec of the environment so far.
+
+        Returns:
+            The same spec with the out_key.
+
+        Raises:
+            KeyError: If an in_key is missing.
+            ValueError: If the scan has another number of rays.
+        """
+        for key in self.in_keys:
+            if unravel_key(key) not in observation_spec.keys(include_nested=True, leaves_only=True):
+                msg = f"environment has no {key!r}; accepted: one that emits {self.in_keys}"
+                raise KeyError(msg)
+        scan = observation_spec[self.in_keys[0]]
+        require(scan.shape[-1] == self.num_rays, "number of rays of the scan", scan.shape[-1], f"num_rays = {self.num_rays}")
+        shape = (*scan.shape[:-1], self.num_channels, self.config.window, self.config.window)
+        observation_spec[self.out_keys[0]] = Bounded(0.0, 1.0, shape=shape, dtype=torch.float32, device=scan.device)
+        return observation_spec
+
+    def _observe(self, stamps: torch.Tensor, steps: torch.Tensor, inputs: list[torch.Tensor]) -> torch.Tensor:
+        """Integrate one scan into ``stamps`` and ``steps`` in place and return the windows."""
+        steps += 1
+        scan, pose = visibility.clean_scan(inputs[0], self.max_range), inputs[1]
+        size = max(1, _CHUNK_CELLS // stamps[0].numel()) if len(stamps) else 1
+        for start in range(0, len(stamps), size):
+            rows = slice(start, start + size)
+            free = visibility.seen_free(self._row_x, self._column_y, scan[rows], pose[rows], self.grid.half_diagonal)
+            torch.lerp(stamps[rows], steps[rows, None, None], free, out=stamps[rows])  # exact: the weights are 0 and 1
+        self._mark_hits(stamps.flatten(1), steps[:, None], scan, inputs)
+        return self._window(stamps.flatten(1), steps[:, None], inputs)
+
+    def _mark_hits(
+        self, stamps: torch.Tensor, steps: torch.Tensor, scan: torch.Tensor, inputs: list[torch.Tensor]
+    ) -> None:
+        # Half a cell below the maximum is five times the LiDAR's noise: a noisy miss is no obstacle.
+        nearest_miss = self.max_range - 0.5 * self.config.resolution
+        pose = inputs[1]
+        points, is_hit = visibility.hit_points(scan, pose, self._directions, nearest_miss)
+        cells, is_inside = visibility.cell_of_points(self.grid, points)
+        is_known = visibility.inside_rectangle(points, pose, self._robot_size)
+        if len(inputs) > 2:
+            is_known |= visibility.inside_rectangle(points, inputs[2], inputs[3], margin=self.config.resolution)
+        is_seen = is_hit & is_inside
+        # What is not to be written goes to cell 0, outside of the extent, as the 0 that is there already. Obstacles come
+        # second: a cell that holds the object and an obstacle is occupied, whatever the order of the rays.
+        stamps.scatter_(1, cells * is_seen, steps * is_seen)
+        is_obstacle = is_seen & ~is_known
+        stamps.scatter_(1, cells * is_obstacle, -steps * is_obstacle)
+
+    def _window(self, stamps: torch.Tensor, steps: torch.Tensor, inputs: list[torch.Tensor]) -> torch.Tensor:
+        cells = visibility.window_cells(self.grid, self._offsets, inputs[1])
+        stamp = torch.gather(stamps, 1, cells)
+        last_seen = stamp.abs()
+        age = torch.sub(steps, last_seen).clamp_(max=self._powers.numel() - 1).long()
+        confidence = self._powers.index_select(0, age.view(-1)).view(age.shape).mul_(last_seen.clamp_(max=1.0))
+        shape = (len(stamps), -1, self.config.window, self.config.window)
+        if self.config.channels == "confidence":
+            return confidence.view(shape)
+        occupancy = stamp.clamp_(-1.0, 0.0).neg_().mul_(self._outside_robot)
+        if len(inputs) > 2:
+            occupancy.mul_(visibility.outside_footprint(self._offsets, *inputs[1:]).flatten(1))
+        if self.config.channels == "product":
+            return confidence.mul_(occupancy).view(shape)
+        return torch.stack((confidence, occupancy), 1).view(shape)
+
+    def _read(self, tensordict: TensorDictBase) -> list[torch.Tensor]:
+        """Return the inputs with one batch dimension, and note the batch's shape."""
+        values = [tensordict.get(key) for key in self.in_keys]
+        if any(value is None for value in values):
+            msg = f"tensordict has only {sorted(map(str, tensordict.keys(True, True)))}; accepted: one that holds {self.in_keys}"
+            raise KeyError(msg)
+        require(values[0].shape[-1] == self.num_rays, "number of rays", values[0].shape[-1], f"num_rays = {self.num_rays}")
+        self._batch_shape = values[0].shape[:-1]
+        return [value.reshape(-1, value.shape[-1]).float() for value in values]
+
+    def _write(self, tensordict: TensorDictBase, window: torch.Tensor) -> TensorDictBase:
+        tensordict.set(self.out_keys[0], window.view(*self._batch_shape, *window.shape[1:]))
+        return tensordict
+
+    def _reset_key(self) -> NestedKey:
+        reset_keys = ["_reset"] if self.parent is None else self.parent.reset_keys
+        require(len(reset_keys) == 1, "reset keys", reset_keys, "environments with one done flag per row")
+        return reset_keys[0]
+
+
+def _decay_powers(decay: float) -> torch.Tensor:
+    """Return ``decay ** k`` for ``k = 0, 1, ...`` until it is 0 in float32 or the greatest age is reached."""
+    if decay <= 0.0:
+        return torch.tensor([1.0, 0.0])
+    steps = 2 if decay >= 1.0 else min(_MAX_AGE, math.ceil(math.log(1e-46) / math.log(decay)))
+    return torch.pow(torch.tensor(decay, dtype=torch.float64), torch.arange(steps + 1)).float()

@@ -1,0 +1,265 @@
+"""Mathematics of CURA-PPO: energy distance, SR(lambda) targets, costs, normalisation. Tensors in, tensors out."""
+
+from __future__ import annotations
+
+import torch
+
+
+def energy_distance(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Return the energy distance between two sets of atoms, exactly and in O((N + M) log(N + M)).
+
+    With F and G the empirical distribution functions, 2 E|x - y| - E|x - x'| - E|y - y'| = 2 * integral (F - G)^2.
+    Between neighbouring merged atoms F - G is constant, so the integral is a sum over atoms with weights that depend on
+    their order alone. Gradients flow through that linear sum and are exact wherever no two atoms are equal.
+
+    Without the absolute values, which the paper's Eq. (6) leaves out, the distance would be unbounded below.
+
+    Args:
+        prediction: Atoms x in any order, shape ``[*B, N]``.
+        target: Atoms y in any order, shape ``[*B, M]``.
+
+    Returns:
+        Energy distance, in the units of the atoms, shape ``[*B]``; never negative but for rounding.
+
+    Raises:
+        ValueError: If the leading shapes differ or a set is empty.
+
+    Source:
+        Paper Eq. (6); Székely and Rizzo (2013), "Energy statistics".
+
+    Examples:
+        2 * (|0 - 1| + |2 - 1|) / 2 - (0 + 2 + 2 + 0) / 4 - 0 = 2 - 1 = 1:
+
+        >>> energy_distance(torch.tensor([0.0, 2.0]), torch.tensor([1.0])).item()
+        1.0
+    """
+    num_x, num_y = prediction.shape[-1], target.shape[-1]
+    if prediction.shape[:-1] != target.shape[:-1] or num_x == 0 or num_y == 0:
+        msg = (
+            f"prediction has shape {tuple(prediction.shape)} and target {tuple(target.shape)}; "
+            "accepted: the same leading shape and at least one atom each"
+        )
+        raise ValueError(msg)
+    merged = torch.cat([prediction, target], -1)
+    # The weights sum to zero: moving the origin changes no value but avoids cancellation far from zero.
+    merged = merged - merged[..., :1].detach()
+    return (merged * _energy_weights(merged, num_x, num_y)).sum(-1)
+
+
+@torch.no_grad()
+def _energy_weights(merged: torch.Tensor, num_x: int, num_y: int) -> torch.Tensor:
+    # 2 sum_k D_k^2 (z_(k+1) - z_k) = sum_k z_k * 2 (D_(k-1)^2 - D_k^2), where D_k is F - G just above sorted atom z_k.
+    order = merged.argsort(-1)
+    # Steps of N M (F - G): whole numbers, so that the sums are exact.
+    steps = torch.where(order < num_x, float(num_y), -float(num_x)).to(merged.dtype)
+    squared = (steps.cumsum(-1) / (num_x * num_y)).square()
+    sorted_weights = -2.0 * squared
+    sorted_weights[..., 1:] += 2.0 * squared[..., :-1]
+    return torch.empty_like(merged).scatter_(-1, order, sorted_weights)
+
+
+def sr_lambda_targets(
+    cost: torch.Tensor,
+    atoms: torch.Tensor,
+    next_atoms: torch.Tensor,
+    terminated: torch.Tensor,
+    truncated: torch.Tensor,
+    *,
+    gamma: float,
+    lmbda: float,
+    generator: torch.Generator | None = None,
+) -> torch.Tensor:
+    """Return target atoms of the distributional Bellman operator by sample replacement, SR(lambda).
+
+    Backward in time, G_t = c_t + gamma * mix_t, where each atom of mix_t is that of G_(t+1) with probability lambda and
+    else that of the estimator at o_(t+1), clamped to [0, 1]. So every target atom is an n-step return with n drawn from
+    a geometric distribution; lambda 0 is one step and lambda 1 is Monte-Carlo.
+
+    - *Terminated*: G_t = c_t. The trace is cut after the terminal step, not before it, so the realised outcome
+      reaches all earlier steps of the episode.
+    - *Truncated*, or last step of the rollout: mix_t is the estimator at o_(t+1) alone.
+
+    Atoms are paired by index and not shuffled. Any pairing is unbiased, since whether an atom is kept does not depend
+    on its value; but output i describes much the same part of the distribution at both steps, so replacing like by like
+    adds less noise than replacing at random: none at all where the two sets agree.
+
+    Args:
+        cost: Collision indicator c_t [1], shape ``[*B, T, 1]``.
+        atoms: Estimator's atoms at o_t, shape ``[*B, T, N]``; only their shape is used, it is that of the targets.
+        next_atoms: Estimator's atoms at o_(t+1), the true last observation where an episode ended, shape
+            ``[*B, T, N]``.
+        terminated: Whether the episode ended for good at step t, bool, shape ``[*B, T, 1]``.
+        truncated: Whether it was cut there, bool, shape ``[*B, T, 1]``; ignored where ``terminated``.
+        gamma: Discount gamma_c per step [1].
+        lmbda: Probability of keeping the sampled return's atom [1].
+        generator: Source of the choices, on any device; none takes the global one.
+
+    Returns:
+        Target atoms [1], shape ``[*B, T, N]``, without gradient. In [0, 1] if every collision terminates.
+
+    Raises:
+        ValueError: If the shapes do not fit together.
+
+    Source:
+        Paper Sec. III-C; Schneider et al. (2024), "Learning Risk-Aware Quadrupedal Locomotion using Distributional
+        Reinforcement Learning" <https://arxiv.org/abs/2309.14246>.
+
+    Examples:
+        Collision at the last of three steps: 0.9^2, 0.9, 1.
+
+        >>> end = torch.tensor([[False], [False], [True]])
+        >>> zeros = torch.zeros(3, 1)
+        >>> sr_lambda_targets(end.float(), zeros, zeros, end, ~end & False, gamma=0.9, lmbda=1.0).squeeze(-1)
+        tensor([0.8100, 0.9000, 1.0000])
+    """
+    if not _is_rollout(atoms, next_atoms, cost, terminated, truncated):
+        shapes = ", ".join(str(tuple(x.shape)) for x in (cost, atoms, next_atoms, terminated, truncated))
+        msg = (
+            f"cost, atoms, next_atoms, terminated, truncated have shapes {shapes}; "
+            "accepted: [*B, T, 1], twice [*B, T, N], and twice [*B, T, 1], with T at least 1"
+        )
+        raise ValueError(msg)
+    with torch.no_grad():
+        bootstrap = next_atoms.clamp(0.0, 1.0)
+        device = next_atoms.device if generator is None else generator.device
+        draws = torch.rand(next_atoms.shape, generator=generator, device=device).to(next_atoms.device)
+        keeps = (draws < lmbda) & ~(terminated | truncated)
+        cost = cost.to(next_atoms.dtype)
+        returns = bootstrap[..., -1, :]  # What follows the rollout's last step.
+        targets = []
+        for t in reversed(range(next_atoms.shape[-2])):
+            mix = torch.where(keeps[..., t, :], returns, bootstrap[..., t, :])
+            step_cost = cost[..., t, :].expand_as(mix)
+            returns = torch.where(terminated[..., t, :], step_cost, step_cost + gamma * mix)
+            targets.append(returns)
+        return torch.stack(targets[::-1], -2)
+
+
+def _is_rollout(atoms: torch.Tensor, next_atoms: torch.Tensor, *signals: torch.Tensor) -> bool:
+    fits = next_atoms.ndim >= 2 and next_atoms.shape[-2] > 0 and atoms.shape == next_atoms.shape
+    return fits and all(signal.shape == (*next_atoms.shape[:-1], 1) for signal in signals)
+
+
+def risk_cost(
+    cost: torch.Tensor, risk: torch.Tensor, next_risk: torch.Tensor, terminated: torch.Tensor, *, gamma: float
+) -> torch.Tensor:
+    """Return the temporal difference of the risk: c_t + gamma_c R(o_(t+1)) - R(o_t).
+
+    After a terminal step nothing can collide any more, so there R(o_(t+1)) counts as zero.
+
+    Args:
+        cost: Collision indicator c_t [1], shape ``[*B]``.
+        risk: R(o_t) [1], shape ``[*B]``.
+        next_risk: R(o_(t+1)) [1], shape ``[*B]``.
+        terminated: Whether the episode ended for good at step t, bool, shape ``[*B]``.
+        gamma: Discount gamma_c per step [1].
+
+    Returns:
+        Risk cost C^R [1], shape ``[*B]``; negative where the action lowered the expected collision possibility.
+
+    Source:
+        Paper Eq. (7).
+
+    Examples:
+        >>> args = torch.tensor([[0.0], [1.0]]), torch.tensor([[0.5], [0.5]]), torch.tensor([[0.5], [0.5]])
+        >>> risk_cost(*args, torch.tensor([[False], [True]]), gamma=0.9).tolist()  # 0.45 - 0.5, 1 - 0.5
+        [[-0.050000011920928955], [0.5]]
+    """
+    return cost.to(risk.dtype) + gamma * next_risk.masked_fill(terminated, 0.0) - risk
+
+
+def uncertainty_cost(uncertainty: torch.Tensor, next_uncertainty: torch.Tensor) -> torch.Tensor:
+    """Return the change of the uncertainty: U(o_(t+1)) - U(o_t).
+
+    It has no meaning on terminal steps: an absorbing state with U = 0 would pay a bonus for crashing while uncertain.
+    Leave them out by the mask of :func:`normalise`, which sets them to zero *after* normalisation.
+
+    Args:
+        uncertainty: U(o_t) [1], shape ``[*B]``.
+        next_uncertainty: U(o_(t+1)) [1], shape ``[*B]``.
+
+    Returns:
+        Uncertainty cost C^U [1], shape ``[*B]``; negative where the next observation is less uncertain.
+
+    Source:
+        Paper Eq. (8).
+
+    Examples:
+        >>> uncertainty_cost(torch.tensor([0.5]), torch.tensor([0.25])).item()
+        -0.25
+    """
+    return next_uncertainty - uncertainty
+
+
+def normalise(values: torch.Tensor, *, floor: float, clip: float, mask: torch.Tensor | None = None) -> torch.Tensor:
+    """Return (x - mean) / max(std, floor), clipped; steps outside the mask count for nothing and become zero.
+
+    Collisions are rare, so the costs are heavy-tailed with a tiny deviation at first: the floor keeps noise small, the
+    clip bounds single steps.
+
+    Args:
+        values: Values x of a whole rollout, any shape.
+        floor: Smallest deviation to divide by, in the units of x.
+        clip: Bound on the magnitude of the result [1].
+        mask: Steps to take into account, bool, shape of ``values``; none takes all.
+
+    Returns:
+        Normalised values [1], shape of ``values``; zero outside the mask and, if it is empty, everywhere.
+
+    Source:
+        The bar in paper Eq. (9); floor and clip are ours.
+
+    Examples:
+        Mean 2 and population deviation 1 of the two steps that count:
+
+        >>> normalise(torch.tensor([1.0, 3.0, 99.0]), floor=0.005, clip=5.0, mask=torch.tensor([True, True, False]))
+        tensor([-1.,  1.,  0.])
+    """
+    mean, std = masked_moments(values, mask)
+    normalised = ((values - mean) / std.clamp_min(floor)).clamp(-clip, clip)
+    return normalised if mask is None else normalised.masked_fill(~mask, 0.0)
+
+
+def masked_moments(values: torch.Tensor, mask: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return mean and population standard deviation of the values inside a mask.
+
+    Args:
+        values: Values, any shape; what is outside the mask may be anything, NaN included.
+        mask: Values to take into account, bool, shape of ``values``; none takes all.
+
+    Returns:
+        Mean and deviation, in the units of the values, shape ``[]``; zero if nothing is inside the mask.
+
+    Examples:
+        >>> mean, std = masked_moments(torch.tensor([1.0, 3.0, float("nan")]), torch.tensor([True, True, False]))
+        >>> mean.item(), std.item()
+        (2.0, 1.0)
+    """
+    mask = torch.ones_like(values, dtype=torch.bool) if mask is None else mask
+    count = mask.sum().clamp_min(1)
+    mean = values.masked_fill(~mask, 0.0).sum() / count
+    return mean, ((values - mean).masked_fill(~mask, 0.0).square().sum() / count).sqrt()
+
+
+def standardise(advantage: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+    """Return the z-score that TorchRL's ``GAE(average_gae=True)`` computes, to the last bit.
+
+    Args:
+        advantage: Advantages of a whole rollout, any shape, at least two of them.
+        mask: Steps to take into account, bool, shape of ``advantage``; none takes all. Others become zero.
+
+    Returns:
+        Standardised advantages [1], shape of ``advantage``.
+
+    Examples:
+        >>> standardise(torch.tensor([1.0, 2.0, 3.0]))
+        tensor([-1.,  0.,  1.])
+    """
+    if mask is None:
+        return (advantage - advantage.mean()) / advantage.std().clamp_min(_GAE_MIN_STD)
+    mean, std = masked_moments(advantage, mask)
+    return ((advantage - mean) / std.clamp_min(_GAE_MIN_STD)).masked_fill(~mask, 0.0)
+
+
+_GAE_MIN_STD = 1e-4
+"""Smallest deviation [1] that TorchRL's GAE divides by."""

@@ -1,0 +1,229 @@
+"""What a configuration means: environment, networks, objective and collector."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import signal
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, TransformedEnv
+
+from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE
+from cura_torchrl.envs.push import ACTION_SIZE, PushEnv
+from cura_torchrl.envs.transforms import ConfidenceMap, EncodeMap
+from cura_torchrl.modules import DistributionalCollisionEstimator, MapVAE, ObservationNorm, make_actor, make_critic
+from cura_torchrl.objectives import CURAAdvantage, CURALoss
+from cura_torchrl.trainers.privileged import ObstacleCode
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tensordict.nn import ProbabilisticTensorDictSequential
+    from torchrl.collectors import BaseCollector
+    from torchrl.envs import EnvBase
+
+    from cura_torchrl.trainers.config import TrainConfig
+
+LATENT_SIZE = 32
+"""Length of the map's code z [1]."""
+
+
+class Networks(nn.Module):
+    """Actor, critic and collision estimator with the normalisation of observations that they share.
+
+    Args:
+        config: Sizes.
+    """
+
+    def __init__(self, config: TrainConfig) -> None:
+        super().__init__()
+        sizes, inputs = config.network, OBSERVATION_SIZE + LATENT_SIZE
+        self.observation_norm = ObservationNorm(OBSERVATION_SIZE)
+        self.actor = make_actor(
+            inputs,
+            ACTION_SIZE,
+            hidden_sizes=sizes.actor_hidden_sizes,
+            init_std=sizes.init_std,
+            observation_norm=self.observation_norm,
+        )
+        self.critic = make_critic(
+            inputs, hidden_sizes=sizes.critic_hidden_sizes, observation_norm=self.observation_norm
+        )
+        self.collision_estimator = DistributionalCollisionEstimator(
+            inputs,
+            num_atoms=config.cura.num_atoms,
+            hidden_sizes=sizes.collision_hidden_sizes,
+            observation_norm=self.observation_norm,
+        )
+
+
+def build_advantage(config: TrainConfig, networks: Networks) -> CURAAdvantage:
+    """Return the estimator of advantages and targets.
+
+    Args:
+        config: Coefficients.
+        networks: Critic and collision estimator.
+
+    Returns:
+        Module that is applied to a whole rollout.
+    """
+    ppo, cura = config.ppo, config.cura
+    return CURAAdvantage(
+        networks.critic,
+        networks.collision_estimator,
+        gamma=ppo.gamma,
+        lmbda=ppo.lmbda,
+        collision_gamma=cura.gamma,
+        collision_lmbda=cura.lmbda,
+        risk_coeff=cura.risk_coeff,
+        uncertainty_coeff=cura.uncertainty_coeff,
+        risk_floor=cura.risk_floor,
+        uncertainty_floor=cura.uncertainty_floor,
+        cost_clip=cura.cost_clip,
+        advantage_scale=cura.advantage_scale,
+        normalise_sum=cura.normalise_sum,
+        seed=config.seed,
+    )
+
+
+def build_loss(config: TrainConfig, networks: Networks) -> CURALoss:
+    """Return the loss of actor, critic and collision estimator.
+
+    Args:
+        config: Coefficients.
+        networks: Networks, on their device.
+
+    Returns:
+        Module that is applied to minibatches.
+    """
+    return CURALoss(
+        networks.actor,
+        networks.critic,
+        networks.collision_estimator,
+        clip_epsilon=config.ppo.clip_epsilon,
+        entropy_coeff=config.ppo.entropy_coeff,
+        critic_coeff=config.ppo.critic_coeff,
+        loss_critic_type="smooth_l1",
+        normalize_advantage=False,
+    )
+
+
+def load_encoder(path: Path | None) -> MapVAE:
+    """Return the frozen encoder of maps.
+
+    Args:
+        path: Weights; None takes those that are shipped.
+
+    Returns:
+        The encoder.
+
+    Raises:
+        FileNotFoundError: If there are no weights.
+    """
+    weights = SHIPPED_ENCODER if path is None else path
+    if not weights.exists():
+        msg = f"encoder weights are missing at {weights}; accepted: a file that `cura-torchrl pretrain-map` has written"
+        raise FileNotFoundError(msg)
+    return MapVAE.load(weights)
+
+
+def make_env(config: TrainConfig, num_envs: int, *, keep_map: bool = False, **options: Any) -> TransformedEnv:
+    """Return the environment with what the policy sees of it.
+
+    Args:
+        config: Environment, map and perception.
+        num_envs: Number of worlds N.
+        keep_map: Whether the window of the map stays in the tensordict under ``confidence_map``.
+        **options: Keyword arguments of :class:`~cura_torchrl.envs.push.PushEnv`.
+
+    Returns:
+        Environment that emits ``observation`` and ``latent`` beside its own keys.
+    """
+    env_config, lidar = config.env, config.env.lidar
+    if config.perception == "privileged":
+        env_config = dataclasses.replace(env_config, task=dataclasses.replace(env_config.task, privileged=True))
+    transforms: list[nn.Module] = []
+    if config.perception == "map" or keep_map:
+        transforms.append(ConfidenceMap(config.map, num_rays=lidar.num_rays, max_range=lidar.max_range))
+    if config.perception == "map":
+        transforms.append(EncodeMap(load_encoder(config.encoder), del_keys=not keep_map))
+    else:
+        transforms.append(ObstacleCode(LATENT_SIZE, is_blind=config.perception == "none"))
+    options.setdefault("seed", config.seed)
+    return TransformedEnv(PushEnv(num_envs, env_config, **options), Compose(*transforms))
+
+
+def make_worker_env(config: TrainConfig, num_envs: int, *, worker: int, frames_done: int) -> EnvBase:
+    """Return the environment of one process that collects.
+
+    Args:
+        config: The run.
+        num_envs: Number of worlds of this process.
+        worker: Index of the process.
+        frames_done: Environment steps so far, over all processes.
+
+    Returns:
+        The environment, which plays its own share of the scenarios.
+    """
+    if config.num_workers > 1:
+        # Runs in the worker: Ctrl-C is for the learner, and each worker draws its own exploration noise.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        torch.set_num_threads(1)
+        torch.manual_seed(config.seed + 7919 * (worker + 1) + frames_done)
+    return make_env(
+        config,
+        num_envs,
+        # An episode lasts a step at least: scenarios from this index on have not been played before a resume.
+        first_episode=frames_done + worker * num_envs,
+        episode_stride=config.num_envs,
+        frames_done=frames_done,
+        frames_per_step=config.num_envs,
+    )
+
+
+@contextmanager
+def build_collector(
+    config: TrainConfig, policy: ProbabilisticTensorDictSequential, *, frames_done: int
+) -> Iterator[BaseCollector]:
+    """Collect rollouts in this process or in several, and stop them in the end.
+
+    Args:
+        config: Number of environments and processes.
+        policy: Policy on the CPU; processes share its memory.
+        frames_done: Environment steps so far.
+
+    Yields:
+        Collector whose batches have the shape ``[num_envs, rollout_steps]``.
+    """
+    share = config.num_envs // config.num_workers
+    factories = [
+        functools.partial(make_worker_env, config, share, worker=worker, frames_done=frames_done)
+        for worker in range(config.num_workers)
+    ]
+    options: dict[str, Any] = {
+        "frames_per_batch": config.frames_per_batch,
+        "total_frames": -1,
+        "auto_register_policy_transforms": False,
+    }
+    if config.num_workers == 1:
+        collector = Collector(factories[0], policy, **options)
+    else:
+        collector = Collector(
+            factories, policy, sync=True, backend="process", backend_options={"cat_results": 0}, **options
+        )
+    # TorchRL takes a thread from the learner for every worker; they never run at the same time here.
+    torch.set_num_threads(config.learner_threads)
+    try:
+        yield collector
+    finally:
+        collector.shutdown()
+
+
+SHIPPED_ENCODER = Path(__file__).parents[1] / "modules" / "weights" / "map_vae.pt"
+"""Weights of the encoder that come with the package."""

@@ -1,0 +1,109 @@
+"""What a result was made with: versions, commit, hardware; and what works on this machine."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import shutil
+import subprocess
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ("cura-torchrl", "torch", "torchrl", "tensordict", "pybullet", "pytorch-kinematics", "numpy", "scipy", "tyro")
+"""Distributions whose versions are recorded beside every checkpoint and result."""
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on.
+
+    Returns:
+        Version by distribution, with Python's own; "not installed" where there is none.
+
+    Examples:
+        >>> versions()["python"] == platform.python_version()
+        True
+    """
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def git_commit() -> str:
+    """Return the commit of the checkout that this package is run from.
+
+    Returns:
+        The commit's hash, followed by ``-dirty`` where files were changed; "unknown" outside a checkout.
+
+    Examples:
+        >>> bool(git_commit())
+        True
+    """
+    here = Path(__file__).resolve()
+    git = shutil.which("git")
+    # An installed copy may lie inside someone else's checkout: only a file that git tracks tells the commit.
+    if git is None or _git(git, here.parent, "ls-files", "--error-unmatch", here.name) is None:
+        return "unknown"
+    return _git(git, here.parent, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*") or "unknown"
+
+
+def _git(git: str, folder: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run([git, "-C", str(folder), *arguments], capture_output=True, text=True, timeout=10, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def hardware() -> dict[str, Any]:
+    """Return what the machine has.
+
+    Returns:
+        Platform, number of processor cores that this process may use, memory [GiB].
+
+    Examples:
+        >>> hardware()["cores"] >= 1
+        True
+    """
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return {"platform": platform.platform(), "cores": len(os.sched_getaffinity(0)), "memory_gib": round(memory, 1)}
+
+
+def capabilities() -> dict[str, bool]:
+    """Return which optional parts work here, without importing them.
+
+    Returns:
+        Whether a part works, by name.
+
+    Examples:
+        >>> set(capabilities()) == {"bullet", "tensorboard", "wandb", "encoder weights"}
+        True
+    """
+    return {
+        "bullet": _is_installed("pybullet"),
+        "tensorboard": _is_installed("tensorboard"),
+        "wandb": _is_installed("wandb"),
+        "encoder weights": (Path(__file__).parents[1] / "modules" / "weights" / "map_vae.pt").exists(),
+    }
+
+
+def shipped_methods() -> list[str]:
+    """Return the methods whose trained weights are installed.
+
+    Returns:
+        Names, sorted.
+
+    Examples:
+        >>> isinstance(shipped_methods(), list)
+        True
+    """
+    return sorted(entry.parent.name for entry in (Path(__file__).parent / "weights").glob("*/config.json"))
+
+
+def _is_installed(package: str) -> bool:
+    return importlib.util.find_spec(package) is not None

@@ -1,0 +1,228 @@
+"""One update of the networks from one rollout."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch.nn.utils import clip_grad_norm_
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+
+from cura_torchrl import keys
+from cura_torchrl.modules.actor_critic import LOG_PROB_KEY
+from cura_torchrl.trainers.build import build_advantage, build_loss
+from cura_torchrl.trainers.diagnostics import explained_variance, risk_auroc
+
+if TYPE_CHECKING:
+    from tensordict import TensorDictBase
+
+    from cura_torchrl.trainers.build import Networks
+    from cura_torchrl.trainers.config import PPOConfig, TrainConfig
+
+
+_SAMPLE_KEYS = (keys.ACTION, LOG_PROB_KEY, "loc", "scale")
+"""What the collecting policy wrote beside what it read."""
+
+_MINIBATCH_KEYS = (
+    keys.OBSERVATION, keys.LATENT, *_SAMPLE_KEYS, keys.ADVANTAGE, keys.VALUE_TARGET, keys.COLLISION_TARGET,
+)  # fmt: skip
+"""What the loss reads. With an advantage among it, TorchRL's loss computes none of its own."""
+
+_LOGGED = ("entropy", "clip_fraction", "ESS")
+"""Diagnostics of TorchRL's loss that are kept."""
+
+
+class NonFiniteError(RuntimeError):
+    """A number that must be finite is not: the message is one line and says which."""
+
+
+class Learner:
+    """Networks, objective and optimisers.
+
+    Args:
+        config: Coefficients and sizes.
+        networks: Networks to train, in place.
+    """
+
+    def __init__(self, config: TrainConfig, networks: Networks) -> None:
+        self.networks = networks.to(config.device)
+        self.frames = 0
+        self.updates = 0
+        self._config = config
+        self._advantage = build_advantage(config, networks)
+        self._loss_module = build_loss(config, networks)
+        self._policy_parameters = [*networks.actor.parameters(), *networks.critic.parameters()]
+        self._collision_parameters = [*networks.collision_estimator.parameters()]
+        self._optimizer = torch.optim.Adam(self._policy_parameters, lr=config.ppo.lr)
+        # Adam divides a gradient by its own scale: the estimator's energy distance would be lost beside the critic's loss in a
+        # shared clip, and its rate must not follow the policy's KL divergence.
+        self._collision_optimizer = torch.optim.Adam(self._collision_parameters, lr=config.cura.lr)
+        size = min(config.ppo.minibatch_size, config.frames_per_batch)
+        self._buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(config.frames_per_batch),
+            sampler=SamplerWithoutReplacement(drop_last=True),
+            batch_size=size,
+        )
+
+    def components(self) -> dict[str, Any]:
+        """Return what a checkpoint holds.
+
+        Returns:
+            Objects with ``state_dict`` and ``load_state_dict``, by name.
+        """
+        return {
+            "networks": self.networks,
+            "optimizer": self._optimizer,
+            "collision_optimizer": self._collision_optimizer,
+            "counters": self,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the counters and the state of the target's random choices.
+
+        Returns:
+            Environment steps and updates so far [1], and the generator's state.
+        """
+        return {"frames": self.frames, "updates": self.updates, "generator": self._advantage.get_extra_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Set what :meth:`state_dict` returned.
+
+        Args:
+            state: Counters and the generator's state.
+        """
+        self.frames, self.updates = int(state["frames"]), int(state["updates"])
+        self._advantage.set_extra_state(state["generator"])
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """Train on a rollout.
+
+        Args:
+            batch: Rollout, shape ``[N, T]``; not changed.
+
+        Returns:
+            Means over the update's minibatches, and statistics of critic and collision estimator before the update.
+
+        Raises:
+            NonFiniteError: If a loss or a gradient is not finite.
+        """
+        data = batch.select(*self._advantage.in_keys, *_SAMPLE_KEYS).to(self._config.device)
+        metrics = self._estimate(data)
+        self._buffer.empty()
+        self._buffer.extend(data.select(*_MINIBATCH_KEYS).reshape(-1))
+        sums: dict[str, torch.Tensor] = defaultdict(lambda: torch.zeros(()))
+        count = 0
+        for _ in range(self._config.ppo.epochs):
+            for minibatch in self._buffer:
+                for name, value in self._step(minibatch.to(self._config.device)).items():
+                    sums[name] = sums[name] + value
+                count += 1
+        # After the last gradient step and before the next rollout: the policy that collects and the policy whose ratio PPO
+        # takes read observations normalised by the same statistics.
+        self.networks.observation_norm.update(data[keys.OBSERVATION])
+        self.frames += batch.numel()
+        self.updates += 1
+        metrics |= {name: (value / count).item() for name, value in sums.items()}
+        return metrics | {"lr": self._optimizer.param_groups[0]["lr"], "std": data["scale"].mean().item()}
+
+    @torch.no_grad()
+    def _estimate(self, data: TensorDictBase) -> dict[str, float]:
+        """Write advantages and targets, all from the networks that collected."""
+        cura = self._config.cura
+        is_trained = self.frames >= cura.costs_start_frames
+        self._advantage.risk_coeff = cura.risk_coeff if is_trained else 0.0
+        self._advantage.uncertainty_coeff = cura.uncertainty_coeff if is_trained else 0.0
+        self._advantage(data)
+        costs = {name: value.item() for name, value in self._advantage.diagnostics(data).items()}
+        return {"explained_variance": explained_variance(data), **costs, "risk_auroc": risk_auroc(data)}
+
+    def _step(self, minibatch: TensorDictBase) -> dict[str, torch.Tensor]:
+        divergence = self._divergence(minibatch)
+        self._adapt_rate(divergence.item())
+        losses = self._loss_module(minibatch)
+        terms = {name: value for name, value in losses.items() if name.startswith("loss_")}
+        total = torch.stack([value.reshape(()) for value in terms.values()]).sum()
+        if not torch.isfinite(total):
+            bad = ", ".join(name for name, value in terms.items() if not torch.isfinite(value).all())
+            raise NonFiniteError(f"{bad} is not finite at {self.frames} frames; the last checkpoint is intact")
+        self._optimizer.zero_grad(set_to_none=True)
+        self._collision_optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        norms = {
+            "grad_norm": self._clip(self._policy_parameters, self._config.ppo.max_grad_norm, "actor and critic"),
+            "collision_grad_norm": self._clip(self._collision_parameters, self._config.cura.max_grad_norm, "estimator"),
+        }
+        self._optimizer.step()
+        self._collision_optimizer.step()
+        scalars = {name: value.detach().mean() for name, value in losses.items() if name in _LOGGED or name in terms}
+        return {**scalars, **norms, "kl": divergence}
+
+    def _clip(self, parameters: list[torch.nn.Parameter], limit: float, whose: str) -> torch.Tensor:
+        norm = clip_grad_norm_(parameters, limit)
+        if not torch.isfinite(norm):
+            raise NonFiniteError(f"gradient of {whose} is not finite at {self.frames} frames; the last checkpoint is intact")
+        return norm
+
+    @torch.no_grad()
+    def _divergence(self, minibatch: TensorDictBase) -> torch.Tensor:
+        """Return the mean KL divergence from the collecting to the present policy [nat]."""
+        now = self.networks.actor.module[0](minibatch.select(keys.OBSERVATION, keys.LATENT))
+        return gaussian_divergence(minibatch["loc"], minibatch["scale"], now["loc"], now["scale"]).mean()
+
+    def _adapt_rate(self, divergence: float) -> None:
+        rate = adapted_rate(self._optimizer.param_groups[0]["lr"], divergence, self._config.ppo)
+        for group in self._optimizer.param_groups:
+            group["lr"] = rate
+
+
+def gaussian_divergence(
+    old_loc: torch.Tensor, old_scale: torch.Tensor, new_loc: torch.Tensor, new_scale: torch.Tensor
+) -> torch.Tensor:
+    """Return the KL divergence from one diagonal Gaussian to another.
+
+    Args:
+        old_loc: Mean of the first, shape ``[*, A]``.
+        old_scale: Standard deviation of the first, shape ``[*, A]``.
+        new_loc: Mean of the second, shape ``[*, A]``.
+        new_scale: Standard deviation of the second, shape ``[*, A]``.
+
+    Returns:
+        KL(old || new) [nat], shape ``[*]``.
+
+    Examples:
+        >>> zero, one = torch.zeros(1), torch.ones(1)
+        >>> gaussian_divergence(zero, one, one, one).item()  # (mean difference)^2 / 2
+        0.5
+    """
+    ratio = old_scale / new_scale
+    shift = (new_loc - old_loc) / new_scale
+    return (0.5 * (ratio.square() + shift.square() - 1.0) - ratio.log()).sum(-1)
+
+
+def adapted_rate(rate: float, divergence: float, config: PPOConfig) -> float:
+    """Return the learning rate that steers the KL divergence to its target.
+
+    Args:
+        rate: Present learning rate [1].
+        divergence: KL divergence from the collecting to the present policy [nat].
+        config: Target, factor and bounds.
+
+    Returns:
+        The rate, lower where the divergence is above twice the target, higher where it is below half of it [1].
+
+    Source:
+        Schulman et al. (2017), Sec. 4, the adaptive KL rule, applied to the learning rate as rsl_rl does.
+
+    Examples:
+        >>> from cura_torchrl.trainers.config import PPOConfig
+        >>> adapted_rate(3e-4, 0.03, PPOConfig(target_kl=0.01))
+        0.0002
+    """
+    if config.target_kl == 0.0:
+        return rate
+    if divergence > 2.0 * config.target_kl:
+        return max(config.min_lr, rate / config.lr_factor)
+    if 0.0 < divergence < 0.5 * config.target_kl:
+        return min(config.max_lr, rate * config.lr_factor)
+    return rate

@@ -1,0 +1,75 @@
+"""The paper's methods as presets: one method is one configuration of the same code."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from dataclasses import dataclass
+
+from cura_torchrl.envs.config import MapConfig, PushEnvConfig
+from cura_torchrl.trainers.config import CURAConfig, TrainConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """What tells a method from the others; all else is the same. Source: paper Sec. V."""
+
+    label: str
+    """Name in tables and figures."""
+    occlusion: bool
+    """Whether the LiDAR sees the pushed object, which then hides what is behind it."""
+    decay: float
+    """alpha of the confidence map [1]: 0.9 is the paper's confidence, 1 accumulates without confidence."""
+    risk_coeff: float
+    """lambda_r [1]."""
+    uncertainty_coeff: float
+    """lambda_u [1]."""
+
+
+METHODS: dict[str, Method] = {
+    "cura-ppo": Method(label="CURA-PPO", occlusion=True, decay=0.9, risk_coeff=0.25, uncertainty_coeff=1.0),
+    "push": Method(label="Push w/ Occlusion", occlusion=True, decay=1.0, risk_coeff=0.0, uncertainty_coeff=0.0),
+    "push-no-occlusion": Method(label="Push w/o Occlusion", occlusion=False, decay=1.0, risk_coeff=0.0, uncertainty_coeff=0.0),
+    "push-conf": Method(label="Baseline w/ Conf.", occlusion=True, decay=0.9, risk_coeff=0.0, uncertainty_coeff=0.0),
+    "cura-no-uncertainty": Method(label="CURA w/o Uncertainty", occlusion=True, decay=0.9, risk_coeff=0.25, uncertainty_coeff=0.0),
+    "cura-no-risk": Method(label="CURA w/o Risk", occlusion=True, decay=0.9, risk_coeff=0.0, uncertainty_coeff=1.0),
+}
+"""The methods by name."""
+
+
+def method(name: str) -> TrainConfig:
+    """Return the configuration that trains a method.
+
+    Args:
+        name: One of :data:`METHODS`.
+
+    Returns:
+        The preset.
+
+    Raises:
+        ValueError: If there is no such method; the line lists those there are.
+
+    Examples:
+        >>> method("push").map.decay
+        1.0
+        >>> method("cura-ppo").cura.uncertainty_coeff
+        1.0
+    """
+    if name not in METHODS:
+        close = difflib.get_close_matches(name, METHODS, n=1)
+        hint = f" (did you mean {close[0]}?)" if close else ""
+        msg = f"method is {name!r}{hint}; accepted: {', '.join(METHODS)}"
+        raise ValueError(msg)
+    preset = METHODS[name]
+    env = PushEnvConfig()
+    return TrainConfig(
+        method=name,
+        env=dataclasses.replace(
+            env,
+            lidar=dataclasses.replace(env.lidar, occlusion=preset.occlusion),
+            # Resets spread out over time; in lockstep the returns oscillate with the episode's phase.
+            task=dataclasses.replace(env.task, random_first_age=True),
+        ),
+        map=MapConfig(decay=preset.decay),
+        cura=CURAConfig(risk_coeff=preset.risk_coeff, uncertainty_coeff=preset.uncertainty_coeff),
+    )

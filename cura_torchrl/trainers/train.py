@@ -1,0 +1,248 @@
+"""The training loop: collect, estimate, update, log, checkpoint; nothing in it is hidden."""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import signal
+import threading
+import time
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torchrl.checkpoint import GlobalRNGState
+
+from cura_torchrl.trainers.build import Networks, build_collector
+from cura_torchrl.trainers.checkpoint import (
+    CHECKPOINT_FOLDER,
+    CheckpointError,
+    find_checkpoint,
+    read_config,
+    restore,
+    save_checkpoint,
+    sweep,
+)
+from cura_torchrl.trainers.diagnostics import (
+    RecentEpisodes,
+    find_non_finite,
+    finished_episodes,
+    rollout_statistics,
+)
+from cura_torchrl.trainers.learner import Learner, NonFiniteError
+from cura_torchrl.trainers.progress import Progress
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from types import FrameType
+
+    from tensordict import TensorDictBase
+    from torchrl.collectors import BaseCollector
+
+    from cura_torchrl.envs.config import TaskConfig
+    from cura_torchrl.trainers.config import TrainConfig
+
+logger = logging.getLogger(__name__)
+
+
+class Interrupted(Exception):  # noqa: N818 - not an error: the run was asked to stop
+    """The run was asked to stop and has written a checkpoint.
+
+    Args:
+        number: The signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(number).name} after writing a checkpoint; go on with --resume")
+        self.number = number
+
+
+def train(config: TrainConfig, *, resume: bool = False, init_from: Path | None = None) -> Path:
+    """Train a method.
+
+    Args:
+        config: The run.
+        resume: Whether to go on from the newest good checkpoint in ``run_dir``.
+        init_from: Checkpoint or run whose networks to start from; optimisers, counters and curriculum start afresh.
+
+    Returns:
+        The last checkpoint.
+
+    Raises:
+        CheckpointError: If a checkpoint is missing or damaged, or ``run_dir`` holds a run that is not to be resumed.
+        NonFiniteError: If a reward, an observation, a loss or a gradient is not finite; the last checkpoint is intact.
+        Interrupted: If SIGINT or SIGTERM asked the run to stop.
+    """  # noqa: DOC502 - raised by what this calls
+    with _locked(config.run_dir), _Signals() as signals:
+        return _Run(config, resume=resume, init_from=init_from).loop(signals)
+
+
+def most_obstacles(task: TaskConfig, frames: int) -> int:
+    """Return K, the most obstacles that an episode may have now.
+
+    Args:
+        task: Curriculum and scenario.
+        frames: Environment steps so far [1].
+
+    Returns:
+        Number of obstacles [1].
+
+    Examples:
+        >>> from cura_torchrl.envs.config import TaskConfig
+        >>> most_obstacles(TaskConfig(curriculum=((0, 0), (1000, 2))), 999)
+        0
+    """
+    if not task.curriculum:
+        return task.scenario.max_obstacles
+    reached = [count for start, count in task.curriculum if start <= frames]
+    return reached[-1] if reached else 0
+
+
+class _Run:
+    """State of a run between updates."""
+
+    def __init__(self, config: TrainConfig, *, resume: bool, init_from: Path | None) -> None:
+        self.config = config
+        self.folder = config.run_dir / CHECKPOINT_FOLDER
+        sweep(self.folder)
+        torch.set_num_threads(config.learner_threads)
+        torch.manual_seed(config.seed)
+        self.learner = Learner(config, Networks(config))
+        self.components = {**self.learner.components(), "rng": GlobalRNGState()}
+        self.saved_at = time.monotonic()
+        source = self._source(resume)
+        if source is not None:
+            restore(source, self.components)
+        elif init_from is not None:
+            start = find_checkpoint(init_from)
+            restore(start, {"networks": self.learner.networks})
+            logger.info("networks start from %s", start)
+
+    def _source(self, resume: bool) -> Path | None:
+        """Return the checkpoint to go on from, or None for a run that starts."""
+        holds_run = self.folder.is_dir() and any(self.folder.iterdir())
+        if not resume and holds_run:
+            msg = f"{self.config.run_dir} holds a run already; accepted: --resume, or another --run-dir"
+            raise CheckpointError(msg)
+        if not resume:
+            return None
+        source = find_checkpoint(self.config.run_dir)
+        before, _ = read_config(source)
+        if before.method != self.config.method:
+            msg = f"method is {self.config.method!r} but {source} was trained as {before.method!r}; accepted: the same method"
+            raise CheckpointError(msg)
+        return source
+
+    def loop(self, signals: _Signals) -> Path:
+        """Train until the frames are spent."""
+        frames = self.learner.frames
+        checkpoint = self._save() if frames == 0 else find_checkpoint(self.config.run_dir)
+        if frames >= self.config.total_frames:
+            return checkpoint
+        progress = Progress(self.config, frames=frames)
+        recent = RecentEpisodes(self.config.recent_episodes)
+        try:
+            with build_collector(self.config, self.learner.networks.actor, frames_done=frames) as collector:
+                self._iterate(collector, signals, progress, recent)
+        except Interrupted:
+            # Raised only between updates or while collecting, so what is saved is the end of a whole update.
+            self._save()
+            raise
+        finally:
+            progress.close()
+        return self._save()
+
+    def _iterate(self, collector: BaseCollector, signals: _Signals, progress: Progress, recent: RecentEpisodes) -> None:
+        while self.learner.frames < self.config.total_frames:
+            started = time.monotonic()
+            with signals.raising():
+                batch = collector.next()
+            collected = time.monotonic()
+            _require_finite(batch, self.learner.frames)
+            recent.extend(finished_episodes(batch))
+            row = {
+                "frames": self.learner.frames + batch.numel(),
+                "max_obstacles": most_obstacles(self.config.env.task, self.learner.frames),
+                **recent.rates(),
+                **rollout_statistics(batch),
+                **self.learner.update(batch),
+            }
+            collector.update_policy_weights_()
+            finished = time.monotonic()
+            row["collect_seconds"], row["update_seconds"] = collected - started, finished - collected
+            row["frames_per_second"] = batch.numel() / (finished - started)
+            progress.add(row)
+            if finished - self.saved_at >= 60.0 * self.config.checkpoint_minutes:
+                self._save()
+
+    def _save(self) -> Path:
+        path = save_checkpoint(
+            self.components,
+            self.config,
+            self.folder,
+            frames=self.learner.frames,
+            keep_last=self.config.keep_checkpoints,
+        )
+        self.saved_at = time.monotonic()
+        return path
+
+
+class _Signals:
+    """Turns SIGINT and SIGTERM into :class:`Interrupted`, but never in the middle of an update; a second one acts at once."""
+
+    def __init__(self) -> None:
+        self._number: int | None = None
+        self._may_raise = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> _Signals:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._restore()
+
+    @contextmanager
+    def raising(self) -> Iterator[None]:
+        """Let a signal interrupt what is done in this context."""
+        self._may_raise = True
+        try:
+            self._check()
+            yield
+        finally:
+            self._may_raise = False
+
+    def _handle(self, number: int, _: FrameType | None) -> None:
+        self._number = number
+        self._restore()
+        self._check()
+
+    def _check(self) -> None:
+        if self._may_raise and self._number is not None:
+            raise Interrupted(self._number)
+
+    def _restore(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep a second process from training in the same folder; the lock dies with the process."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            msg = f"{folder} is being trained in by another process; accepted: another --run-dir"
+            raise CheckpointError(msg) from None
+        yield
+
+
+def _require_finite(batch: TensorDictBase, frames: int) -> None:
+    bad = find_non_finite(batch)
+    if bad is not None:
+        msg = f"{bad} of the rollout is not finite at {frames} frames; the last checkpoint is intact"
+        raise NonFiniteError(msg)
