@@ -62,12 +62,15 @@ contracts: $(STAMP)
 spelling: $(STAMP)
 	$(BIN)/codespell
 
-# A wheel without its robot, policies and encoder would install and then fail: build it, unpack it, and run it from there.
+# A wheel without its robot, policies or encoder would install and then fail: build it, unpack it, look for every file of the
+# package, and play an episode from there.
 wheel: $(STAMP)
 	@rm -rf build/wheel && mkdir -p build/wheel
 	$(BIN)/python $(PIP) wheel --no-deps --wheel-dir build/wheel .
 	$(BIN)/python $(PIP) install --no-deps --target build/wheel/site build/wheel/*.whl
-	cd build/wheel/site && ../../../$(BIN)/python -m cura_torchrl.trainers.cli info >/dev/null
+	@cd build/wheel/site && git -C ../../.. ls-files -z cura_torchrl | xargs -0 ls -d >/dev/null
+	cd build/wheel/site && ../../../$(BIN)/python -m cura_torchrl.trainers.cli evaluate --policy scripted \
+		--max-obstacles 0 --episodes 1 --chunk 1 --json >/dev/null
 
 format: $(STAMP) ## Format the code and apply the safe fixes
 	$(BIN)/ruff check --fix $(SOURCES)
@@ -84,5 +87,5 @@ docs: $(DOCS_STAMP) ## Build the documentation into docs/_build/html
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
 clean: ## Remove .venv and everything built (runs/ stays)
-	rm -rf $(VENV) build dist docs/_build .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache .coverage
+	rm -rf $(VENV) build dist docs/_build .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache .coverage*
 	find cura_torchrl tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -195,6 +195,7 @@ class TaskConfig:
     def __post_init__(self) -> None:
         require_finite(self)
         require(self.policy_period > 0, "policy_period", self.policy_period, "a positive time [s]")
+        require(self.success_time >= 0, "success_time", self.success_time, "a time that is not negative [s]")
         require(self.episode_time >= self.policy_period, "episode_time", self.episode_time, "at least one policy period [s]")
         frames = [step[0] for step in self.curriculum]
         require(frames == sorted(frames), "curriculum", self.curriculum, "steps in increasing frames")

@@ -130,6 +130,9 @@ class PushEnv(EnvBase):
         self._terms = torch.zeros(rows, len(REWARD_TERM_NAMES))
         self._state: WorldState | None = None
         self._scan = torch.zeros(rows, self.config.lidar.num_rays)
+        self._tcp = torch.zeros(rows, 3, dtype=torch.float64)
+        self._hand_rotation = torch.zeros(rows, 3, 3, dtype=torch.float64)
+        self._jacobian = torch.zeros(rows, 6, 7, dtype=torch.float64)
         self.scenario = self._sample(torch.arange(rows))
 
     @property
@@ -178,6 +181,7 @@ class PushEnv(EnvBase):
         self.scenario[rows] = self._sample(self._episode[rows])
         self._clear(rows)
         self._build(rows)
+        self._read()
         self._spawn()
         self._measure(rows)
         return self._emit()
@@ -223,12 +227,22 @@ class PushEnv(EnvBase):
         stream = ("train", "eval", "vae").index(self.config.task.stream)
         self._lidar.reset(rows.tolist(), [(stream, seed, int(self._episode[row])) for row in rows])
 
+    def _read(self) -> None:
+        """Read the state of all worlds, and where it puts the TCP."""
+        self._state = self._worlds.state()
+        self._tcp, self._hand_rotation, self._jacobian = self._controller.kinematics.forward(self._state.joint_position)
+
     def _spawn(self) -> None:
-        state = self._worlds.state()
-        tcp, _, _ = self._controller.kinematics.forward(state.joint_position)
+        """Let obstacles appear whose time has come."""
+        time = self._elapsed.double() * self.config.task.policy_period
+        slots = torch.arange(scenarios.OBSTACLE_SLOTS)
+        due = (slots < self.scenario["num_obstacles"][:, None]) & (self.scenario["obstacle_time"] <= time[:, None])
+        if not bool((due & ~self._obstacle_active).any()):
+            return
+        state, tcp = self.world_state, self._tcp
         active, pose = scenarios.spawn_obstacles(
             self.config.task.scenario, self.scenario, self._obstacle_active, self._obstacle_pose,
-            time=self._elapsed.double() * self.config.task.policy_period, base_pose=state.base_pose,
+            time=time, base_pose=state.base_pose,
             tcp_position=geometry.from_frame(state.base_pose, tcp[:, :2]), object_pose=_planar(state),
         )  # fmt: skip
         for row, slot in (active & ~self._obstacle_active).nonzero().tolist():
@@ -237,8 +251,8 @@ class PushEnv(EnvBase):
         self._obstacle_active, self._obstacle_pose = active, pose
 
     def _measure(self, rows: torch.Tensor) -> None:
-        """Read the state of all worlds and the scans of the given ones."""
-        self._state = state = self._worlds.state()
+        """Scan in the given rows."""
+        state = self.world_state
         edge = torch.where(self._obstacle_active, self.scenario["obstacle_edge"], 0.0)
         bodies = torch.cat([self._obstacle_pose, _planar(state)[:, None]], dim=1)
         seen = self.scenario["object_edge"] if self.config.lidar.occlusion else torch.zeros(self.num_envs, dtype=torch.float64)
@@ -259,6 +273,7 @@ class PushEnv(EnvBase):
         self._worlds.advance(self._controller, self._ticks)
         self.frames_done += self._frames_per_step
         self._elapsed = self._elapsed + 1
+        self._read()
         self._spawn()
         self._measure(torch.arange(self.num_envs))
         cost, reward = self._judge(action, before)
@@ -276,8 +291,7 @@ class PushEnv(EnvBase):
         self._success, self._since_success = latch_success(self._success, self._since_success, flags=flags, contact=state.contact)
         self._tipped = self._tipped | (geometry.tilt_from_quaternion(state.object_quaternion) > task.tilt_limit)
         goal = torch.cat([scene["goal_pose"][:, :2], scene["object_edge"][:, None] / 2], dim=-1)
-        tcp, _, _ = self._controller.kinematics.forward(state.joint_position)
-        tcp_w = torch.cat([geometry.from_frame(state.base_pose, tcp[:, :2]), tcp[:, 2:]], dim=-1)
+        tcp_w = torch.cat([geometry.from_frame(state.base_pose, self._tcp[:, :2]), self._tcp[:, 2:]], dim=-1)
         terms = reward_terms(
             task.reward,
             object_corners=geometry.cube_corners(state.object_position, state.object_quaternion, scene["object_edge"]),
@@ -297,15 +311,14 @@ class PushEnv(EnvBase):
     def _emit(self) -> TensorDict:
         """Return every observation as fresh tensors."""
         state, scene = self.world_state, self.scenario
-        tcp, rotation, jacobian = self._controller.kinematics.forward(state.joint_position)
         pose = _planar(state)
         out = {
             keys.OBSERVATION: observe(
                 base_pose=state.base_pose,
                 base_velocity=state.base_velocity,
-                tcp_position_b=tcp,
-                hand_rotation_b=rotation,
-                tcp_velocity_b=self._tcp_velocity(tcp, jacobian),
+                tcp_position_b=self._tcp,
+                hand_rotation_b=self._hand_rotation,
+                tcp_velocity_b=self._tcp_velocity(),
                 previous_action=self._previous_action,
                 object_position=state.object_position,
                 object_yaw=pose[:, 2],
@@ -330,12 +343,12 @@ class PushEnv(EnvBase):
         emitted = TensorDict(out, batch_size=self.batch_size)
         return emitted if self.device is None else emitted.to(self.device)
 
-    def _tcp_velocity(self, tcp: torch.Tensor, jacobian: torch.Tensor) -> torch.Tensor:
+    def _tcp_velocity(self) -> torch.Tensor:
         """Velocity of the TCP relative to the world, in the base frame [m/s], shape ``[N, 3]``."""
-        state = self.world_state
+        state, tcp = self.world_state, self._tcp
         base = geometry.rotate(state.base_velocity[:, :2], -state.base_pose[:, 2])
         spin = state.base_velocity[:, 2]
-        arm = (jacobian[:, :3] @ state.joint_velocity[:, :, None])[:, :, 0]
+        arm = (self._jacobian[:, :3] @ state.joint_velocity[:, :, None])[:, :, 0]
         moved = torch.stack([base[:, 0] - spin * tcp[:, 1], base[:, 1] + spin * tcp[:, 0], torch.zeros_like(spin)], dim=-1)
         return arm + moved
 

@@ -17,8 +17,9 @@ from torchrl.envs import Compose, TransformedEnv
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE
 from cura_torchrl.envs.push import ACTION_SIZE, PushEnv
 from cura_torchrl.envs.transforms import ConfidenceMap, EncodeMap
-from cura_torchrl.modules import DistributionalCollisionEstimator, MapVAE, ObservationNorm, make_actor, make_critic
+from cura_torchrl.modules import DistributionalCollisionEstimator, ObservationNorm, make_actor, make_critic
 from cura_torchrl.objectives import CURAAdvantage, CURALoss
+from cura_torchrl.trainers.errors import UnavailableError
 from cura_torchrl.trainers.privileged import ObstacleCode
 
 if TYPE_CHECKING:
@@ -124,12 +125,14 @@ def load_encoder(path: Path | None) -> MapVAE:
         The encoder.
 
     Raises:
-        FileNotFoundError: If there are no weights.
+        UnavailableError: If there are no weights.
     """
     weights = SHIPPED_ENCODER if path is None else path
     if not weights.exists():
         msg = f"encoder weights are missing at {weights}; accepted: a file that `cura-torchrl pretrain-map` has written"
-        raise FileNotFoundError(msg)
+        raise UnavailableError(msg)
+    from cura_torchrl.modules import MapVAE
+
     return MapVAE.load(weights)
 
 
@@ -210,6 +213,7 @@ def build_collector(
         "frames_per_batch": config.frames_per_batch,
         "total_frames": -1,
         "auto_register_policy_transforms": False,
+        "use_buffers": True,
     }
     if config.num_workers == 1:
         collector = Collector(factories[0], policy, **options)

@@ -1,27 +1,38 @@
 """Checkpoints that are whole or not there: staged, hashed, flushed to disk, and published by one rename.
 
-A checkpoint is a folder: TorchRL's manifest and components (no pickle), ``config.json`` with the resolved configuration, seed,
-versions and commit, and ``SHA256SUMS`` over all files. The weights that are shipped have the same form without optimisers.
+A checkpoint is a folder: TorchRL's manifest and components (no pickle), ``config.json`` with the resolved
+configuration, seed, versions and commit, and ``SHA256SUMS`` over all files. The weights that are shipped have the same
+form without optimisers.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import logging
 import os
 import shutil
 import uuid
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, StateDictCheckpointAdapter
 
+from cura_torchrl.trainers.build import Networks, make_env
 from cura_torchrl.trainers.config import TrainConfig
-from cura_torchrl.trainers.info import git_commit, versions
+from cura_torchrl.trainers.errors import CheckpointError
+from cura_torchrl.trainers.info import git_commit, shipped_methods, versions
+from cura_torchrl.trainers.methods import METHODS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from torchrl.envs import EnvBase
+
+    from cura_torchrl.envs.config import TaskConfig
 
 logger = logging.getLogger(__name__)
 
@@ -31,12 +42,10 @@ CONFIG_NAME = "config.json"
 """File of a checkpoint with the resolved configuration and where it came from."""
 SUMS_NAME = "SHA256SUMS"
 """File of a checkpoint with the hash of every other file, in the format of ``sha256sum``."""
+SHIPPED_FOLDER = Path(__file__).parent / "weights"
+"""Folder of the weights that come with the package, one folder a method."""
 _PREFIX = "checkpoint"
 _STAGE_PREFIX = ".stage-"
-
-
-class CheckpointError(ValueError):
-    """A checkpoint is missing, damaged, or does not fit: the message is one line."""
 
 
 def save_checkpoint(
@@ -180,6 +189,109 @@ def restore(path: Path, components: Mapping[str, Any]) -> None:
         reason = " ".join(str(error).split())[:300]
         msg = f"checkpoint {path} does not fit this configuration: {reason}"
         raise CheckpointError(msg) from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadedPolicy:
+    """Trained networks with all that is needed to run them."""
+
+    policy: ProbabilisticTensorDictSequential
+    """Actor; under TorchRL's ``ExplorationType.DETERMINISTIC`` it returns its mean."""
+    critic: TensorDictModule
+    """State value."""
+    collision_estimator: TensorDictModule
+    """Distribution of the collision possibility, risk and uncertainty."""
+    config: TrainConfig
+    """What the networks were trained with."""
+    record: dict[str, Any]
+    """Content of ``config.json``: frames, seed, versions, commit."""
+    path: Path
+    """Where the networks came from."""
+
+    def make_env(
+        self, num_envs: int, *, task: TaskConfig | None = None, keep_map: bool = False, **options: Any
+    ) -> EnvBase:
+        """Return the environment that the policy was trained for, on the frozen evaluation scenarios.
+
+        Args:
+            num_envs: Number of worlds N.
+            task: Task to play; None is the trained one with all its obstacles.
+            keep_map: Whether the window of the map stays in the tensordict under ``confidence_map``.
+            **options: Keyword arguments of :class:`~cura_torchrl.envs.push.PushEnv`, such as ``seed``.
+
+        Returns:
+            The environment with its transforms.
+        """
+        played = self.config.env.task if task is None else task
+        played = dataclasses.replace(played, stream="eval", random_first_age=False, curriculum=())
+        config = self.config.replace(env=dataclasses.replace(self.config.env, task=played))
+        return make_env(config, num_envs, keep_map=keep_map, **options)
+
+
+def load_policy(source: str | Path) -> LoadedPolicy:
+    """Load trained networks.
+
+    Args:
+        source: Name of a method whose weights are shipped, or the path of a run or checkpoint.
+
+    Returns:
+        Networks in evaluation mode on the CPU, and their configuration.
+
+    Raises:
+        CheckpointError: If there is no such method or path, or the checkpoint is damaged.
+    """  # noqa: DOC502 - raised by what this calls
+    path = find_checkpoint(_resolve(source))
+    config, record = read_config(path)
+    networks = Networks(config)
+    restore(path, {"networks": networks})
+    networks.requires_grad_(False).eval()
+    return LoadedPolicy(
+        policy=networks.actor,
+        critic=networks.critic,
+        collision_estimator=networks.collision_estimator,
+        config=config,
+        record=record,
+        path=path,
+    )
+
+
+def export_policy(source: Path, destination: Path | None = None) -> Path:
+    """Write a run's newest networks, without optimisers, in the form in which weights are shipped.
+
+    Args:
+        source: A run or a checkpoint.
+        destination: Folder to write; None is the package's own folder for the method.
+
+    Returns:
+        The folder that was written.
+
+    Raises:
+        CheckpointError: If there is no checkpoint or it is damaged.
+    """  # noqa: DOC502 - raised by what this calls
+    path = find_checkpoint(source)
+    config, record = read_config(path)
+    networks = Networks(config)
+    restore(path, {"networks": networks})
+    folder = SHIPPED_FOLDER / config.method if destination is None else destination
+    # Paths of the machine that trained say nothing elsewhere.
+    released = config.replace(run_dir=Path("runs") / config.method, encoder=None)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    return write_checkpoint({"networks": networks}, released, folder, frames=record["frames"])
+
+
+def _resolve(source: str | Path) -> Path:
+    if isinstance(source, str) and source in METHODS:
+        shipped = SHIPPED_FOLDER / source
+        if not shipped.exists():
+            available = ", ".join(shipped_methods()) or "none"
+            msg = f"no weights of method {source!r} are shipped; accepted: {available}, or the path of a checkpoint"
+            raise CheckpointError(msg)
+        return shipped
+    path = Path(source)
+    if not path.exists():
+        msg = f"no checkpoint at {source}; accepted: the path of a run or checkpoint, or one of {', '.join(METHODS)}"
+        raise CheckpointError(msg)
+    return path
 
 
 def _coordinator(components: Mapping[str, Any]) -> Checkpoint:

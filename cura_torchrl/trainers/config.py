@@ -1,7 +1,7 @@
 """Frozen configuration of training and evaluation: pure data, importable without torch.
 
-The environment's own configuration is nested, not copied. A field's docstring gives its unit; ``cura-torchrl train --help``
-prints it. The eight methods are presets of :class:`TrainConfig`, see :mod:`cura_torchrl.trainers.methods`.
+The environment's own configuration is nested, not copied. A field's docstring gives its unit; ``cura-torchrl train
+--help`` prints it. The methods are presets of :class:`TrainConfig`, see :mod:`cura_torchrl.trainers.methods`.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from cura_torchrl.envs.config import MapConfig, PushEnvConfig, require, require_finite
+from cura_torchrl.envs.config import MapConfig, PushEnvConfig, ScenarioKind, require, require_finite
 from cura_torchrl.trainers.decoding import decode, encode
 
 LoggerKind = Literal["csv", "tensorboard", "wandb"]
 Simulator = Literal["bullet"]
+ScriptedKind = Literal["scripted", "avoider", "random"]
 Perception = Literal["map", "none", "privileged"]
 
 
@@ -85,7 +86,7 @@ class CURAConfig:
     cost_clip: float = 5.0
     """Bound on the magnitude of a normalised cost [1]."""
     advantage_scale: Literal["raw", "zscore"] = "raw"
-    """Scale of the advantage beside the costs: as it is (the letter of the paper), or to mean 0 and deviation 1 first."""
+    """Scale of the advantage beside the costs: as it is (the paper), or brought to mean 0 and deviation 1 first."""
     normalise_sum: bool = True
     """Whether the advantage with its costs is brought to mean 0 and deviation 1 for the optimiser."""
     costs_start_frames: int = 200_000
@@ -145,7 +146,7 @@ class TrainConfig:
     run_dir: Path = Path("runs/train")
     """Folder for checkpoints and logs."""
     perception: Perception = "map"
-    """What the policy sees beside its vector observation: the map's code; nothing; or, for diagnosis, the true obstacles."""
+    """What the policy sees beside its vector: the map's code, nothing, or, for diagnosis, the true obstacles."""
     encoder: Path | None = None
     """Weights of the map's encoder, as ``pretrain-map`` writes them; none takes those that are shipped."""
     device: str = "cpu"
@@ -173,12 +174,31 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         require_finite(self)
-        for name in ("num_envs", "num_workers", "total_frames", "learner_threads", "keep_checkpoints", "recent_episodes"):
+        for name in (
+            "num_envs",
+            "num_workers",
+            "total_frames",
+            "learner_threads",
+            "keep_checkpoints",
+            "recent_episodes",
+        ):
             require(getattr(self, name) > 0, name, getattr(self, name), "1 or more")
-        require(self.num_envs % self.num_workers == 0, "num_envs", self.num_envs, f"a multiple of num_workers {self.num_workers}")
+        require(
+            self.num_envs % self.num_workers == 0,
+            "num_envs",
+            self.num_envs,
+            f"a multiple of num_workers {self.num_workers}",
+        )
         require(0 <= self.seed < 2**31, "seed", self.seed, "0 to 2147483647")
-        require(self.checkpoint_minutes >= 0, "checkpoint_minutes", self.checkpoint_minutes, "a time that is not negative [min]")
-        require(self.env.simulator == self.simulator, "env.simulator", self.env.simulator, f"simulator {self.simulator!r}")
+        require(
+            self.checkpoint_minutes >= 0,
+            "checkpoint_minutes",
+            self.checkpoint_minutes,
+            "a time that is not negative [min]",
+        )
+        require(
+            self.env.simulator == self.simulator, "env.simulator", self.env.simulator, f"simulator {self.simulator!r}"
+        )
 
     @property
     def frames_per_batch(self) -> int:
@@ -208,13 +228,13 @@ class TrainConfig:
             The configuration.
 
         Raises:
-            ValueError: If a key is unknown, or a value has the wrong type or is not acceptable; one line names the key.
+            ValueError: If a key is unknown, or a value has the wrong type or is not acceptable; one line.
 
         Examples:
             >>> TrainConfig.from_json({"ppo": {"lr": "fast"}})
             Traceback (most recent call last):
             ValueError: ppo.lr is 'fast'; accepted: a finite number
-        """
+        """  # noqa: DOC502 - raised by what this calls
         return decode(cls, data)
 
     def replace(self, **changes: Any) -> TrainConfig:
@@ -231,3 +251,43 @@ class TrainConfig:
             5
         """
         return dataclasses.replace(self, **changes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """Who plays which of the frozen evaluation scenarios. Episode i of a seed is the same scene for everyone."""
+
+    checkpoint: Path | None = None
+    """Trained policy: a run's or a checkpoint's folder."""
+    method: str | None = None
+    """Trained policy: a method whose weights are shipped."""
+    policy: ScriptedKind | None = None
+    """Policy without learning: a pusher that sees no obstacles, one that sees them all, or random actions."""
+    scenario: ScenarioKind = "uniform"
+    """Where obstacles appear."""
+    object_size: float = 0.5
+    """Edge of the pushed cube [m]; the paper's are 0.5, 0.75 and 1.0."""
+    max_obstacles: int = 6
+    """Most obstacles K in an episode; the count is uniform in 0..K. Range: 0 to 6."""
+    episodes: int = 200
+    """Episodes to play [1]."""
+    seed: int = 0
+    """Seed of the scenarios [1]."""
+    simulator: Simulator = "bullet"
+    """Which simulator runs the worlds."""
+    num_workers: int = 1
+    """Processes that play [1]; results do not depend on it."""
+    chunk: int = 20
+    """Episodes played side by side [1]; networks round differently in another size of batch, so keep it to compare."""
+
+    def __post_init__(self) -> None:
+        require_finite(self)
+        given = [value for value in (self.checkpoint, self.method, self.policy) if value is not None]
+        require(
+            len(given) == 1, "policy to evaluate", [str(value) for value in given], "one of checkpoint, method, policy"
+        )
+        require(0.3 <= self.object_size <= 1.2, "object_size", self.object_size, "0.3 to 1.2 m")
+        require(0 <= self.max_obstacles <= 6, "max_obstacles", self.max_obstacles, "0 to 6")
+        for name in ("episodes", "num_workers", "chunk"):
+            require(getattr(self, name) > 0, name, getattr(self, name), "1 or more")
+        require(0 <= self.seed < 2**31, "seed", self.seed, "0 to 2147483647")

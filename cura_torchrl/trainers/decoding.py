@@ -1,7 +1,7 @@
 """Strict, typed conversion between frozen dataclasses and JSON values.
 
-An error is one line: the path of the key, the value, and what is accepted. No class is ever looked up by name, so that a
-file can only fill fields in.
+An error is one line: the path of the key, the value, and what is accepted. No class is ever looked up by name, so
+that a file can only fill fields in.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def decode(cls: type[T], data: object, path: str = "") -> T:
         ValueError: y is an unknown key; accepted: x
     """
     if not isinstance(data, dict):
-        raise _refusal(path or cls.__name__, data, "an object with keys")
+        raise ValueError(_refusal(path or cls.__name__, data, "an object with keys"))  # noqa: TRY004 - it is a value
     names = [item.name for item in dataclasses.fields(cls)]  # type: ignore[arg-type]
     for key in data:
         if key not in names:
@@ -81,10 +81,10 @@ def _join(path: str, key: str) -> str:
     return f"{path}.{key}" if path else key
 
 
-def _refusal(path: str, value: object, accepted: str) -> ValueError:
+def _refusal(path: str, value: object, accepted: str) -> str:
     text = repr(value)
     shown = text if len(text) <= 60 else text[:57] + "..."
-    return ValueError(f"{path} is {shown}; accepted: {accepted}")
+    return f"{path} is {shown}; accepted: {accepted}"
 
 
 def _decode_value(hint: Any, value: object, path: str) -> Any:
@@ -103,18 +103,20 @@ def _decode_value(hint: Any, value: object, path: str) -> Any:
 
 def _decode_literal(options: tuple[Any, ...], value: object, path: str) -> Any:
     if value not in options:
-        raise _refusal(path, value, ", ".join(map(str, options)))
+        raise ValueError(_refusal(path, value, ", ".join(map(str, options))))
     return value
 
 
 def _decode_tuple(hints: tuple[Any, ...], value: object, path: str) -> tuple[Any, ...]:
     if not isinstance(value, list):
-        raise _refusal(path, value, "a list")
+        raise ValueError(_refusal(path, value, "a list"))  # noqa: TRY004 - it is a value
     if hints[-1] is Ellipsis:
         hints = (hints[0],) * len(value)
     if len(hints) != len(value):
-        raise _refusal(path, value, f"a list of {len(hints)}")
-    return tuple(_decode_value(hint, entry, f"{path}[{i}]") for i, (hint, entry) in enumerate(zip(hints, value, strict=True)))
+        raise ValueError(_refusal(path, value, f"a list of {len(hints)}"))
+    return tuple(
+        _decode_value(hint, entry, f"{path}[{i}]") for i, (hint, entry) in enumerate(zip(hints, value, strict=True))
+    )
 
 
 def _decode_scalar(hint: Any, value: object, path: str) -> Any:
@@ -127,7 +129,7 @@ def _decode_scalar(hint: Any, value: object, path: str) -> Any:
         return value
     if hint is Path and isinstance(value, str):
         return Path(value)
-    raise _refusal(path, value, _ACCEPTED.get(hint, str(hint)))
+    raise ValueError(_refusal(path, value, _ACCEPTED.get(hint, str(hint))))
 
 
 _ACCEPTED = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a string", Path: "a path"}

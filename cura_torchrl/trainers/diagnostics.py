@@ -65,8 +65,8 @@ class RecentEpisodes:
         """Return rates over the remembered episodes.
 
         Returns:
-            Success, collision and time-out rate [1], mean length [policy steps], number of episodes, and the success rate for
-            each edge of the object; NaN where there are none.
+            Success, collision and time-out rate [1], mean length [policy steps], number of episodes, and the success
+            rate for each edge of the object; NaN where there are none.
         """
         outcomes = list(self._outcomes)
         result = {
@@ -77,7 +77,9 @@ class RecentEpisodes:
             "episodes": float(len(outcomes)),
         }
         for edge in sorted({episode.object_size for episode in outcomes}):
-            result[f"success_{edge:.2f}m"] = _mean([episode.success for episode in outcomes if episode.object_size == edge])
+            result[f"success_{edge:.2f}m"] = _mean(
+                [episode.success for episode in outcomes if episode.object_size == edge]
+            )
         return result
 
 

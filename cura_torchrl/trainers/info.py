@@ -11,7 +11,17 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("cura-torchrl", "torch", "torchrl", "tensordict", "pybullet", "pytorch-kinematics", "numpy", "scipy", "tyro")
+PACKAGES = (
+    "cura-torchrl",
+    "torch",
+    "torchrl",
+    "tensordict",
+    "pybullet",
+    "pytorch-kinematics",
+    "numpy",
+    "scipy",
+    "tyro",
+)
 """Distributions whose versions are recorded beside every checkpoint and result."""
 
 
@@ -25,13 +35,7 @@ def versions() -> dict[str, str]:
         >>> versions()["python"] == platform.python_version()
         True
     """
-    found = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            found[package] = "not installed"
-    return found
+    return {"python": platform.python_version(), **{package: _version(package) for package in PACKAGES}}
 
 
 def git_commit() -> str:
@@ -54,7 +58,9 @@ def git_commit() -> str:
 
 def _git(git: str, folder: Path, *arguments: str) -> str | None:
     try:
-        done = subprocess.run([git, "-C", str(folder), *arguments], capture_output=True, text=True, timeout=10, check=False)
+        done = subprocess.run(
+            [git, "-C", str(folder), *arguments], capture_output=True, text=True, timeout=10, check=False
+        )
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() if done.returncode == 0 else None
@@ -103,6 +109,13 @@ def shipped_methods() -> list[str]:
         True
     """
     return sorted(entry.parent.name for entry in (Path(__file__).parent / "weights").glob("*/config.json"))
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
 
 
 def _is_installed(package: str) -> bool:

@@ -13,6 +13,7 @@ from cura_torchrl import keys
 from cura_torchrl.modules.actor_critic import LOG_PROB_KEY
 from cura_torchrl.trainers.build import build_advantage, build_loss
 from cura_torchrl.trainers.diagnostics import explained_variance, risk_auroc
+from cura_torchrl.trainers.errors import NonFiniteError
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
@@ -33,10 +34,6 @@ _LOGGED = ("entropy", "clip_fraction", "ESS")
 """Diagnostics of TorchRL's loss that are kept."""
 
 
-class NonFiniteError(RuntimeError):
-    """A number that must be finite is not: the message is one line and says which."""
-
-
 class Learner:
     """Networks, objective and optimisers.
 
@@ -55,8 +52,8 @@ class Learner:
         self._policy_parameters = [*networks.actor.parameters(), *networks.critic.parameters()]
         self._collision_parameters = [*networks.collision_estimator.parameters()]
         self._optimizer = torch.optim.Adam(self._policy_parameters, lr=config.ppo.lr)
-        # Adam divides a gradient by its own scale: the estimator's energy distance would be lost beside the critic's loss in a
-        # shared clip, and its rate must not follow the policy's KL divergence.
+        # In a shared clip the estimator's energy distance would be lost beside the critic's loss, and its learning rate
+        # must not follow the policy's KL divergence.
         self._collision_optimizer = torch.optim.Adam(self._collision_parameters, lr=config.cura.lr)
         size = min(config.ppo.minibatch_size, config.frames_per_batch)
         self._buffer = TensorDictReplayBuffer(
@@ -106,7 +103,7 @@ class Learner:
 
         Raises:
             NonFiniteError: If a loss or a gradient is not finite.
-        """
+        """  # noqa: DOC502 - raised by what this calls
         data = batch.select(*self._advantage.in_keys, *_SAMPLE_KEYS).to(self._config.device)
         metrics = self._estimate(data)
         self._buffer.empty()
@@ -118,8 +115,8 @@ class Learner:
                 for name, value in self._step(minibatch.to(self._config.device)).items():
                     sums[name] = sums[name] + value
                 count += 1
-        # After the last gradient step and before the next rollout: the policy that collects and the policy whose ratio PPO
-        # takes read observations normalised by the same statistics.
+        # After the last gradient step and before the next rollout: the policy that collects and the policy whose ratio
+        # PPO takes read observations normalised by the same statistics.
         self.networks.observation_norm.update(data[keys.OBSERVATION])
         self.frames += batch.numel()
         self.updates += 1
@@ -128,11 +125,11 @@ class Learner:
 
     @torch.no_grad()
     def _estimate(self, data: TensorDictBase) -> dict[str, float]:
-        """Write advantages and targets, all from the networks that collected."""
+        # Advantages and targets are written into the data, all from the networks that collected.
         cura = self._config.cura
         is_trained = self.frames >= cura.costs_start_frames
-        self._advantage.risk_coeff = cura.risk_coeff if is_trained else 0.0
-        self._advantage.uncertainty_coeff = cura.uncertainty_coeff if is_trained else 0.0
+        self._advantage.risk_coeff.fill_(cura.risk_coeff if is_trained else 0.0)
+        self._advantage.uncertainty_coeff.fill_(cura.uncertainty_coeff if is_trained else 0.0)
         self._advantage(data)
         costs = {name: value.item() for name, value in self._advantage.diagnostics(data).items()}
         return {"explained_variance": explained_variance(data), **costs, "risk_auroc": risk_auroc(data)}
@@ -161,7 +158,9 @@ class Learner:
     def _clip(self, parameters: list[torch.nn.Parameter], limit: float, whose: str) -> torch.Tensor:
         norm = clip_grad_norm_(parameters, limit)
         if not torch.isfinite(norm):
-            raise NonFiniteError(f"gradient of {whose} is not finite at {self.frames} frames; the last checkpoint is intact")
+            raise NonFiniteError(
+                f"gradient of {whose} is not finite at {self.frames} frames; the last checkpoint is intact"
+            )
         return norm
 
     @torch.no_grad()

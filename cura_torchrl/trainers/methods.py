@@ -29,9 +29,13 @@ class Method:
 METHODS: dict[str, Method] = {
     "cura-ppo": Method(label="CURA-PPO", occlusion=True, decay=0.9, risk_coeff=0.25, uncertainty_coeff=1.0),
     "push": Method(label="Push w/ Occlusion", occlusion=True, decay=1.0, risk_coeff=0.0, uncertainty_coeff=0.0),
-    "push-no-occlusion": Method(label="Push w/o Occlusion", occlusion=False, decay=1.0, risk_coeff=0.0, uncertainty_coeff=0.0),
+    "push-no-occlusion": Method(
+        label="Push w/o Occlusion", occlusion=False, decay=1.0, risk_coeff=0.0, uncertainty_coeff=0.0
+    ),
     "push-conf": Method(label="Baseline w/ Conf.", occlusion=True, decay=0.9, risk_coeff=0.0, uncertainty_coeff=0.0),
-    "cura-no-uncertainty": Method(label="CURA w/o Uncertainty", occlusion=True, decay=0.9, risk_coeff=0.25, uncertainty_coeff=0.0),
+    "cura-no-uncertainty": Method(
+        label="CURA w/o Uncertainty", occlusion=True, decay=0.9, risk_coeff=0.25, uncertainty_coeff=0.0
+    ),
     "cura-no-risk": Method(label="CURA w/o Risk", occlusion=True, decay=0.9, risk_coeff=0.0, uncertainty_coeff=1.0),
 }
 """The methods by name."""

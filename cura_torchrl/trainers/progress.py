@@ -1,4 +1,4 @@
-"""What a run shows and keeps while it trains: one row per update in progress.csv, TorchRL's logger, and a progress bar."""
+"""What a run shows and keeps while it trains: a row per update in progress.csv, TorchRL's logger, a progress bar."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 from torchrl.record.loggers import get_logger
 from tqdm import tqdm
+
+from cura_torchrl.trainers.errors import UnavailableError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,7 +34,7 @@ class Progress:
         frames: Environment steps so far [1].
 
     Raises:
-        ValueError: If the logger's package is not installed.
+        UnavailableError: If the logger's package is not installed.
     """
 
     def __init__(self, config: TrainConfig, *, frames: int) -> None:
@@ -40,7 +42,13 @@ class Progress:
         self._rows = [row for row in read_progress(self._path) if row["frames"] <= frames]
         self._logger = _make_logger(config)
         self._bar = tqdm(
-            total=config.total_frames, initial=frames, unit="f", unit_scale=True, file=sys.stderr, smoothing=0.1, mininterval=1.0
+            total=config.total_frames,
+            initial=frames,
+            unit="f",
+            unit_scale=True,
+            file=sys.stderr,
+            smoothing=0.1,
+            mininterval=1.0,
         )
         self._columns: list[str] = []
 
@@ -108,6 +116,7 @@ def _rounded(row: dict[str, float]) -> dict[str, str]:
 
 def _make_logger(config: TrainConfig) -> Logger:
     if config.logger != "csv" and importlib.util.find_spec(config.logger) is None:
-        msg = f"logger is {config.logger!r}, which is not installed; accepted: csv, or pip install cura-torchrl[{config.logger}]"
-        raise ValueError(msg)
+        install = f"pip install cura-torchrl[{config.logger}]"
+        msg = f"logger is {config.logger!r}, which is not installed; accepted: csv, or first {install}"
+        raise UnavailableError(msg)
     return get_logger(config.logger, logger_name=str(config.run_dir), experiment_name="log")

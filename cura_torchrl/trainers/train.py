@@ -16,7 +16,6 @@ from torchrl.checkpoint import GlobalRNGState
 from cura_torchrl.trainers.build import Networks, build_collector
 from cura_torchrl.trainers.checkpoint import (
     CHECKPOINT_FOLDER,
-    CheckpointError,
     find_checkpoint,
     read_config,
     restore,
@@ -29,7 +28,8 @@ from cura_torchrl.trainers.diagnostics import (
     finished_episodes,
     rollout_statistics,
 )
-from cura_torchrl.trainers.learner import Learner, NonFiniteError
+from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NonFiniteError
+from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.progress import Progress
 
 if TYPE_CHECKING:
@@ -44,18 +44,6 @@ if TYPE_CHECKING:
     from cura_torchrl.trainers.config import TrainConfig
 
 logger = logging.getLogger(__name__)
-
-
-class Interrupted(Exception):  # noqa: N818 - not an error: the run was asked to stop
-    """The run was asked to stop and has written a checkpoint.
-
-    Args:
-        number: The signal.
-    """
-
-    def __init__(self, number: int) -> None:
-        super().__init__(f"stopped by {signal.Signals(number).name} after writing a checkpoint; go on with --resume")
-        self.number = number
 
 
 def train(config: TrainConfig, *, resume: bool = False, init_from: Path | None = None) -> Path:
@@ -120,7 +108,7 @@ class _Run:
             logger.info("networks start from %s", start)
 
     def _source(self, resume: bool) -> Path | None:
-        """Return the checkpoint to go on from, or None for a run that starts."""
+        # The checkpoint to go on from, or None for a run that starts.
         holds_run = self.folder.is_dir() and any(self.folder.iterdir())
         if not resume and holds_run:
             msg = f"{self.config.run_dir} holds a run already; accepted: --resume, or another --run-dir"
@@ -130,12 +118,12 @@ class _Run:
         source = find_checkpoint(self.config.run_dir)
         before, _ = read_config(source)
         if before.method != self.config.method:
-            msg = f"method is {self.config.method!r} but {source} was trained as {before.method!r}; accepted: the same method"
+            msg = f"method is {self.config.method!r} but {source} is of {before.method!r}; accepted: the same method"
             raise CheckpointError(msg)
         return source
 
     def loop(self, signals: _Signals) -> Path:
-        """Train until the frames are spent."""
+        # Trains until the frames are spent.
         frames = self.learner.frames
         checkpoint = self._save() if frames == 0 else find_checkpoint(self.config.run_dir)
         if frames >= self.config.total_frames:
@@ -189,7 +177,7 @@ class _Run:
 
 
 class _Signals:
-    """Turns SIGINT and SIGTERM into :class:`Interrupted`, but never in the middle of an update; a second one acts at once."""
+    """Turns SIGINT and SIGTERM into an exception, but never in the middle of an update; a second one acts at once."""
 
     def __init__(self) -> None:
         self._number: int | None = None
@@ -230,7 +218,7 @@ class _Signals:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep a second process from training in the same folder; the lock dies with the process."""
+    # Keeps a second process from training in the same folder; the lock dies with the process.
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / ".lock").open("w") as file:
         try:

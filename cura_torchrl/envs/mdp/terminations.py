@@ -77,5 +77,5 @@ def endings(
     """
     terminated = contact.any(-1)
     is_late = elapsed_steps >= round(task.episode_time / task.policy_period)
-    is_over = (steps_since_success >= 0) & (steps_since_success >= round(task.success_time / task.policy_period))
+    is_over = steps_since_success >= round(task.success_time / task.policy_period)
     return terminated, (is_late | is_over) & ~terminated

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from cura_torchrl.envs.config import PhysicsConfig, RobotConfig
+from cura_torchrl.envs.mdp import geometry
 from cura_torchrl.envs.robots import ridgeback_franka as model
 from cura_torchrl.envs.robots.kinematics import ArmKinematics, damped_least_squares
 
@@ -89,37 +90,39 @@ class ImpedanceController:
         implicit[:, arm, arm] += self._stiffness * self.period**2
         self._gain = mass_matrix @ np.linalg.inv(implicit)
 
-    def torques(self, tick: int, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Return the joint torques of one tick.
+    def torques(self, rows: slice, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Return the joint torques of one tick for consecutive robots; :meth:`solve_ik` sets where they head.
 
         Args:
-            tick: Tick within the policy step; the differential IK is solved in every ``ik_ticks``-th.
-            position: Joints (base x [m], y [m], yaw [rad], arm [rad]), shape ``[N, 10]``.
-            velocity: Their velocities, shape ``[N, 10]``.
+            rows: Which robots, B of them.
+            position: Their joints (base x [m], y [m], yaw [rad], arm [rad]), shape ``[B, 10]``.
+            velocity: Their velocities, shape ``[B, 10]``.
 
         Returns:
-            Forces and torques [N, N, N m, N m ...], shape ``[N, 10]``.
+            Forces and torques [N, N, N m, N m ...], shape ``[B, 10]``.
 
         Source:
             Tan, Liu and Turk (2011), "Stable proportional-derivative controllers", eq. (11).
         """
-        if tick % self.ik_ticks == 0:
-            self._solve_ik()
         arm_position, arm_velocity = position[:, BASE_DOF:], velocity[:, BASE_DOF:]
-        self.reference += self._rate * self.period
-        np.clip(self.reference, self._lower, self._upper, out=self.reference)
+        reference, command = self.reference[rows], self.base_command[rows]
+        reference += self._rate[rows] * self.period
         centre = arm_position + self._lag * arm_velocity
-        np.clip(self.reference, centre - self._reach, centre + self._reach, out=self.reference)
-        self.base_command += np.clip(self._base_target - self.base_command, -self._ramp, self._ramp)
+        lower, upper = np.maximum(self._lower, centre - self._reach), np.minimum(self._upper, centre + self._reach)
+        np.minimum(np.maximum(reference, lower, out=reference), upper, out=reference)
+        ramp = self._base_target[rows] - command
+        command += np.minimum(np.maximum(ramp, -self._ramp), self._ramp)
         force = np.empty_like(position)
-        force[:, :BASE_DOF] = self._damping[:BASE_DOF] * (_to_world(self.base_command, position[:, 2]) - velocity[:, :BASE_DOF])
-        error = self.reference - arm_position - self.period * arm_velocity
+        force[:, :BASE_DOF] = self._damping[:BASE_DOF] * (_to_world(command, position[:, 2]) - velocity[:, :BASE_DOF])
+        error = reference - arm_position - self.period * arm_velocity
         force[:, BASE_DOF:] = self._stiffness * error - self._damping[BASE_DOF:] * arm_velocity
-        torque = (self._gain @ force[:, :, None])[:, :, 0]
-        torque[:, BASE_DOF:] = np.clip(torque[:, BASE_DOF:], -self._torque_limit, self._torque_limit)
+        torque = (self._gain[rows] @ force[:, :, None])[:, :, 0]
+        arm = torque[:, BASE_DOF:]
+        np.minimum(np.maximum(arm, -self._torque_limit, out=arm), self._torque_limit, out=arm)
         return torque
 
-    def _solve_ik(self) -> None:
+    def solve_ik(self) -> None:
+        """Set the rate of every joint reference from the commanded twist; due every ``ik_ticks`` ticks."""
         reference = torch.from_numpy(self.reference.copy())
         tcp, rotation, jacobian = self.kinematics.forward(reference)
         twist = torch.cat([self._linear(tcp), self._angular(tcp, rotation)], dim=-1)
@@ -146,7 +149,8 @@ class ImpedanceController:
         """Angular velocity that turns the hand's axis towards the object's centre, within limits [rad/s]."""
         config = self.config
         offset = torch.from_numpy(self._object_xy_b) - tcp[:, :2]
-        yaw = torch.atan2(offset[:, 1], offset[:, 0].clamp_min(1e-3)).clamp(-config.max_hand_yaw, config.max_hand_yaw)
+        ahead = torch.stack([offset[:, 0].clamp_min(1e-3), offset[:, 1]], dim=-1)
+        yaw = geometry.angle_of(ahead).clamp(-config.max_hand_yaw, config.max_hand_yaw)
         target = hand_rotation(yaw, config.hand_tilt)
         # Sum of the cross products of the axes: twice the rotation vector to first order.
         error = 0.5 * torch.cross(rotation.mT, target.mT, dim=-1).sum(-2)
@@ -175,4 +179,7 @@ def hand_rotation(yaw: torch.Tensor, tilt: float) -> torch.Tensor:
 
 def _to_world(twist: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.stack([cos * twist[:, 0] - sin * twist[:, 1], sin * twist[:, 0] + cos * twist[:, 1], twist[:, 2]], axis=-1)
+    world = twist.copy()
+    world[:, 0] = cos * twist[:, 0] - sin * twist[:, 1]
+    world[:, 1] = sin * twist[:, 0] + cos * twist[:, 1]
+    return world

@@ -79,7 +79,9 @@ class Lidar:
         for row, key in zip(rows, keys, strict=True):
             self._noise[row] = np.random.Generator(np.random.Philox(np.random.SeedSequence(key)))
 
-    def scan(self, rows: list[int], pose: torch.Tensor, body_pose: torch.Tensor, body_edge: torch.Tensor) -> torch.Tensor:
+    def scan(
+        self, rows: list[int], pose: torch.Tensor, body_pose: torch.Tensor, body_edge: torch.Tensor
+    ) -> torch.Tensor:
         """Measure.
 
         Args:

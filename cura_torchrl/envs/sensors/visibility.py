@@ -8,20 +8,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_FAR = 1e6
+"""Coordinate of the cells that stand for the outside [m]: beyond the reach of any ray."""
+
 _VECTOR_LANES = 16
-"""Row lengths are multiples of this, so that a cell's value never depends on its place in the batch (vectorised body or scalar tail)."""
+"""Row lengths are multiples of this: no cell falls to a loop's scalar tail in one batch and not in another."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapGrid:
     """A grid of square cells over a rectangle of the world, framed by cells that stand for everything outside.
 
-    A stored map has shape ``[num_rows, num_columns]``: row ``i + 1`` and column ``j`` hold the cell whose lower corner is
-    ``(x_min + i * resolution, y_min + j * resolution)``. The first and the last row, and the columns added to round up
-    their number, lie outside of the world: they are at an infinite distance from everything and always unseen.
+    A stored map has shape ``[num_rows, num_columns]``: row ``i + 1`` and column ``j`` hold the cell whose lower corner
+    is ``(x_min + i * resolution, y_min + j * resolution)``. The first and the last row, and the columns added to round
+    up their number, lie outside of the extent: they are far away from everything and always unseen.
 
     Examples:
         >>> grid = MapGrid(extent_x=(0.0, 0.3), extent_y=(0.0, 0.2), resolution=0.1)
@@ -38,7 +45,8 @@ class MapGrid:
 
     def __post_init__(self) -> None:
         if self.resolution <= 0 or self.num_x < 1 or self.num_y < 1:
-            msg = f"grid over x {self.extent_x}, y {self.extent_y} at {self.resolution} m has no cells; accepted: a positive area"
+            area = f"x {self.extent_x}, y {self.extent_y} at {self.resolution} m"
+            msg = f"grid over {area} has no cells; accepted: a positive area"
             raise ValueError(msg)
         if self.num_rows * self.num_columns > 2**24:
             msg = f"grid has {self.num_rows * self.num_columns} cells; accepted: at most 2**24, which float32 can count"
@@ -70,16 +78,35 @@ class MapGrid:
         return self.resolution * math.sqrt(0.5)
 
     def row_x(self) -> torch.Tensor:
-        """Return the world x of the cell centres of each row [m], infinite outside, shape ``[num_rows]``."""
+        """Return the world x of the cell centres of each row [m], far away outside, shape ``[num_rows]``."""
         centres = self.extent_x[0] + (torch.arange(-1, self.num_x + 1, dtype=torch.float64) + 0.5) * self.resolution
-        centres[[0, -1]] = math.inf
+        centres[[0, -1]] = _FAR
         return centres.float()
 
     def column_y(self) -> torch.Tensor:
-        """Return the world y of the cell centres of each column [m], infinite outside, shape ``[num_columns]``."""
+        """Return the world y of the cell centres of each column [m], far away outside, shape ``[num_columns]``."""
         centres = self.extent_y[0] + (torch.arange(self.num_columns, dtype=torch.float64) + 0.5) * self.resolution
-        centres[self.num_y :] = math.inf
+        centres[self.num_y :] = _FAR
         return centres.float()
+
+
+def work_space(shape: Sequence[int], num_floats: int, device: torch.device | None = None) -> tuple[torch.Tensor, ...]:
+    """Allocate memory that the functions below reuse: fresh memory can cost more than their arithmetic.
+
+    Args:
+        shape: Shape of each tensor; the first dimension is the largest batch.
+        num_floats: How many float32 tensors.
+        device: Where they live.
+
+    Returns:
+        ``num_floats`` float32 tensors, then one int64 tensor, uninitialised.
+
+    Examples:
+        >>> [tensor.dtype for tensor in work_space((2, 3), 1)]
+        [torch.float32, torch.int64]
+    """
+    floats = (torch.empty(*shape, device=device) for _ in range(num_floats))
+    return *floats, torch.empty(*shape, dtype=torch.int64, device=device)
 
 
 def unit_vector(angle: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -123,7 +150,7 @@ def clean_scan(scan: torch.Tensor, max_range: float) -> torch.Tensor:
         max_range: What a miss reads [m].
 
     Returns:
-        The ranges [m], same shape; not-a-number becomes 0 (a ray that has seen nothing), infinity becomes ``max_range``.
+        The ranges [m], same shape; not-a-number becomes 0 (a ray that has seen nothing), infinity ``max_range``.
 
     Examples:
         >>> clean_scan(torch.tensor([float("nan"), float("inf"), 3.0]), 10.0).tolist()
@@ -133,22 +160,28 @@ def clean_scan(scan: torch.Tensor, max_range: float) -> torch.Tensor:
 
 
 def seen_free(
-    row_x: torch.Tensor, column_y: torch.Tensor, scan: torch.Tensor, sensor_pose: torch.Tensor, half_diagonal: float
+    row_x: torch.Tensor,
+    column_y: torch.Tensor,
+    scan: torch.Tensor,
+    sensor_pose: torch.Tensor,
+    half_diagonal: float,
+    scratch: Sequence[torch.Tensor] | None = None,
 ) -> torch.Tensor:
     """Tell which cells a scan has seen to be free.
 
-    A cell is seen free if its centre is nearer to the sensor than the range of the ray nearest to its bearing, less half
-    a cell's diagonal. This leaves no gaps between few rays and needs one lookup a cell.
+    A cell is seen free if its centre is nearer to the sensor than the range of the ray nearest to its bearing, less
+    half a cell's diagonal. This leaves no gaps between few rays and needs one lookup a cell.
 
     Args:
-        row_x: World x of the cell centres of each row [m], shape ``[X]``; infinite: never seen.
-        column_y: World y of the cell centres of each column [m], shape ``[Y]``; infinite: never seen.
+        row_x: World x of the cell centres of each row [m], shape ``[X]``.
+        column_y: World y of the cell centres of each column [m], shape ``[Y]``.
         scan: Ranges as from :func:`clean_scan` [m], rays as in :func:`ray_bearings`, shape ``[N, R]``.
         sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
         half_diagonal: Half of a cell's diagonal [m].
+        scratch: Work space of one float tensor to overwrite, shape ``[N, X, Y]``; None allocates it.
 
     Returns:
-        1 where the cell is seen free, else 0, float32, shape ``[N, X, Y]``.
+        1 where the cell is seen free, else 0, float32, shape ``[N, X, Y]``; aliases the work space.
 
     Examples:
         >>> centres = torch.tensor([1.0, 2.0, 3.0])
@@ -160,51 +193,50 @@ def seen_free(
     rays_per_radian = num_rays / (2 * math.pi)
     dx = row_x[:, None] - sensor_pose[:, 0, None, None]
     dy = column_y - sensor_pose[:, 1, None, None]
+    position, ray = scratch or work_space((len(scan), len(row_x), len(column_y)), 1, scan.device)
     # Nearest ray to world bearing b: floor((b - yaw + pi) R / 2 pi + 1/2) mod R. With the yaw taken modulo a turn and R
     # added, the index is not negative, and the table three times in a row replaces the modulo.
     turned = torch.remainder((math.pi - sensor_pose[:, 2]) * rays_per_radian, num_rays)
-    position = torch.atan2(dy, dx).mul_(rays_per_radian).add_((turned + (num_rays + 0.5))[:, None, None])
+    torch.atan2(dy, dx, out=position).mul_(rays_per_radian).add_((turned + (num_rays + 0.5))[:, None, None])
+    ray.copy_(position)
     reach = (scan - half_diagonal).clamp_(min=0.0).square_().repeat(1, 3)
-    ray = position.long().flatten(1)
-    margin = torch.gather(reach, 1, ray, out=position.view(ray.shape)).view(position.shape)
-    return margin.sub_(dx.square()).sub_(dy.square()).sign_().relu_()
+    torch.gather(reach, 1, ray.flatten(1), out=position.flatten(1))
+    return position.sub_(dx.square()).sub_(dy.square()).sign_().relu_()
 
 
-def hit_points(
-    scan: torch.Tensor, sensor_pose: torch.Tensor, directions: torch.Tensor, nearest_miss: float
+def ray_ends(
+    scan: torch.Tensor, sensor_pose: torch.Tensor, directions: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return where rays end, and which of them have hit something.
+    """Return where rays end.
 
     Args:
-        scan: Ranges as from :func:`clean_scan` [m], shape ``[N, R]``.
+        scan: Ranges [m], shape ``[N, R]``.
         sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
         directions: Unit vectors along the rays in the base frame [1], shape ``[2, R]``.
-        nearest_miss: A range this long or longer is a miss [m].
 
     Returns:
-        End points in the world frame [m], shape ``[N, R, 2]``, and whether each is a hit, bool, shape ``[N, R]``. A
-        range of 0 is no hit.
+        World x and y of the end points [m], both of shape ``[N, R]``.
 
     Examples:
-        >>> ahead = torch.tensor([[1.0, 1.0], [0.0, 0.0]])
-        >>> points, is_hit = hit_points(torch.tensor([[2.0, 10.0]]), torch.zeros(1, 3), ahead, 9.9)
-        >>> points[0, 0].tolist(), is_hit.tolist()
-        ([2.0, 0.0], [[True, False]])
+        >>> x, y = ray_ends(torch.tensor([[2.0]]), torch.tensor([[1.0, 1.0, 0.0]]), torch.tensor([[1.0], [0.0]]))
+        >>> x.tolist(), y.tolist()
+        ([[3.0]], [[1.0]])
     """
     cos, sin = unit_vector(sensor_pose[:, 2, None])
     ahead, left = directions
-    world = torch.stack((cos * ahead - sin * left, sin * ahead + cos * left), -1)
-    points = world.mul_(scan[..., None]).add_(sensor_pose[:, None, :2])
-    return points, (scan > 0.0) & (scan < nearest_miss)
+    x = (cos * ahead - sin * left).mul_(scan).add_(sensor_pose[:, 0, None])
+    y = (sin * ahead + cos * left).mul_(scan).add_(sensor_pose[:, 1, None])
+    return x, y
 
 
 def inside_rectangle(
-    points: torch.Tensor, pose: torch.Tensor, size: torch.Tensor, margin: float = 0.0
+    x: torch.Tensor, y: torch.Tensor, pose: torch.Tensor, size: torch.Tensor, margin: float = 0.0
 ) -> torch.Tensor:
     """Tell which points lie inside of a rectangle.
 
     Args:
-        points: Points in the world frame [m], shape ``[N, K, 2]``.
+        x: World x of the points [m], shape ``[N, K]``.
+        y: World y of the points [m], shape ``[N, K]``.
         pose: Rectangle's centre (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
         size: Rectangle's (length, width) [m], shape ``[N, 2]`` or ``[2]``.
         margin: Added on each side [m].
@@ -213,38 +245,40 @@ def inside_rectangle(
         Whether a point lies inside or on the edge, bool, shape ``[N, K]``.
 
     Examples:
-        >>> points = torch.tensor([[[0.4, 0.0], [0.6, 0.0]]])
-        >>> inside_rectangle(points, torch.zeros(1, 3), torch.ones(2)).tolist()
+        >>> inside_rectangle(torch.tensor([[0.4, 0.6]]), torch.zeros(1, 2), torch.zeros(1, 3), torch.ones(2)).tolist()
         [[True, False]]
     """
     cos, sin = unit_vector(pose[:, 2, None])
-    x, y = (points - pose[:, None, :2]).unbind(-1)
+    x, y = x - pose[:, 0, None], y - pose[:, 1, None]
     half = size / 2 + margin
-    return ((x * cos + y * sin).abs() <= half[..., 0, None]) & ((y * cos - x * sin).abs() <= half[..., 1, None])
+    along = (x * cos).add_(y * sin).abs_().sub_(half[..., 0, None])
+    across = y.mul_(cos).sub_(x.mul_(sin)).abs_().sub_(half[..., 1, None])
+    return torch.maximum(along, across) <= 0.0
 
 
-def cell_of_points(grid: MapGrid, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def cell_of_points(grid: MapGrid, x: torch.Tensor, y: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the cell that each point lies in, as an index into the flattened stored map.
 
     Args:
         grid: The map's cells.
-        points: Points in the world frame [m], shape ``[N, K, 2]``.
+        x: World x of the points [m], any shape.
+        y: World y of the points [m], same shape.
 
     Returns:
-        Flat index, int64, and whether the point lies inside of the extent, bool, both of shape ``[N, K]``; outside, the
-        index is 0, a cell that stands for the outside.
+        Flat index, int64, and whether the point lies inside of the extent, bool, both of the points' shape. Points
+        outside get the index of some cell.
 
     Examples:
         >>> grid = MapGrid(extent_x=(0.0, 0.3), extent_y=(0.0, 0.2), resolution=0.1)
-        >>> cell, is_inside = cell_of_points(grid, torch.tensor([[[0.05, 0.15], [-1.0, 0.0]]]))
-        >>> cell.tolist(), is_inside.tolist()
-        ([[17, 0]], [[True, False]])
+        >>> cell, is_inside = cell_of_points(grid, torch.tensor([0.05, -1.0]), torch.tensor([0.15, 0.0]))
+        >>> cell[0].item(), is_inside.tolist()
+        (17, [True, False])
     """
-    i = torch.floor((points[..., 0] - grid.extent_x[0]) / grid.resolution)
-    j = torch.floor((points[..., 1] - grid.extent_y[0]) / grid.resolution)
-    is_inside = (i >= 0) & (i < grid.num_x) & (j >= 0) & (j < grid.num_y)
-    cell = ((i + 1) * grid.num_columns + j) * is_inside
-    return cell.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0).long(), is_inside
+    i = torch.floor((x - grid.extent_x[0]).div_(grid.resolution))
+    j = torch.floor((y - grid.extent_y[0]).div_(grid.resolution))
+    row, column = i.clamp(0, grid.num_x - 1), j.clamp(0, grid.num_y - 1)
+    is_inside = i.sub_(row).abs_().add_(j.sub_(column).abs_()) == 0.0
+    return torch.add(column, row.add_(1), alpha=grid.num_columns).long(), is_inside
 
 
 def window_offsets(window: int, resolution: float) -> torch.Tensor:
@@ -264,7 +298,9 @@ def window_offsets(window: int, resolution: float) -> torch.Tensor:
     return ((torch.arange(window, dtype=torch.float64) - (window - 1) / 2) * resolution).float()
 
 
-def window_cells(grid: MapGrid, offsets: torch.Tensor, sensor_pose: torch.Tensor) -> torch.Tensor:
+def window_cells(
+    grid: MapGrid, offsets: torch.Tensor, sensor_pose: torch.Tensor, scratch: Sequence[torch.Tensor] | None = None
+) -> torch.Tensor:
     """Return the map cell under each cell of a window that is centred on, and turned with, the sensor.
 
     Window row ``i`` lies at base-frame x = ``offsets[i]`` (forward as ``i`` grows), column ``j`` at base-frame
@@ -274,30 +310,37 @@ def window_cells(grid: MapGrid, offsets: torch.Tensor, sensor_pose: torch.Tensor
         grid: The map's cells.
         offsets: Window offsets as from :func:`window_offsets` [m], shape ``[W]``.
         sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
+        scratch: Work space of three float tensors to overwrite, shape ``[N, W, W]``; None allocates it.
 
     Returns:
-        Index into the flattened stored map, int64, shape ``[N, W * W]``; outside of the extent, a cell that is always unseen.
+        Index into the flattened stored map, int64, shape ``[N, W, W]``; outside of the extent, that of a cell that is
+        always unseen. Aliases the work space.
 
     Examples:
         >>> grid = MapGrid(extent_x=(0.0, 0.4), extent_y=(0.0, 0.4), resolution=0.1)
         >>> window_cells(grid, window_offsets(2, 0.1), torch.tensor([[0.2, 0.2, 0.0]])).tolist()
-        [[33, 34, 49, 50]]
+        [[[33, 34], [49, 50]]]
     """
     ahead, left = offsets[:, None] / grid.resolution, offsets / grid.resolution
     cos, sin = unit_vector(sensor_pose[:, 2, None, None])
     start_x = (sensor_pose[:, 0, None, None] - grid.extent_x[0]) / grid.resolution
     start_y = (sensor_pose[:, 1, None, None] - grid.extent_y[0]) / grid.resolution
-    j = torch.add(start_y + sin * ahead, cos * left).floor_()
-    column = j.clamp(0, grid.num_y - 1)
+    j, column, i, cells = scratch or work_space((len(sensor_pose), len(offsets), len(offsets)), 3, offsets.device)
+    torch.add(start_y + sin * ahead, cos * left, out=j).floor_()
+    torch.clamp(j, 0, grid.num_y - 1, out=column)
     # A column outside of the extent sends the row outside too: one index then tells all.
     beyond = j.sub_(column).abs_()
-    i = torch.add(start_x + cos * ahead, -sin * left).floor_().clamp_(-1, grid.num_x)
+    torch.add(start_x + cos * ahead, -sin * left, out=i).floor_().clamp_(-1, grid.num_x)
     row = i.sub_(beyond, alpha=grid.num_x + 1).clamp_(min=-1).add_(1)
-    return torch.add(column, row, alpha=grid.num_columns).long().flatten(1)
+    return cells.copy_(column.add_(row, alpha=grid.num_columns))
 
 
 def outside_footprint(
-    offsets: torch.Tensor, sensor_pose: torch.Tensor, pose: torch.Tensor, size: torch.Tensor
+    offsets: torch.Tensor,
+    sensor_pose: torch.Tensor,
+    pose: torch.Tensor,
+    size: torch.Tensor,
+    scratch: Sequence[torch.Tensor] | None = None,
 ) -> torch.Tensor:
     """Tell which cells of the sensor's window have their centre outside of a rectangle.
 
@@ -306,12 +349,14 @@ def outside_footprint(
         sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
         pose: Rectangle's centre (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
         size: Rectangle's (length, width) [m], shape ``[N, 2]`` or ``[2]``.
+        scratch: Two float tensors to overwrite, shape ``[N, W, W]``; None allocates them.
 
     Returns:
-        1 outside, 0 inside or on the edge, float32, shape ``[N, W, W]``.
+        1 outside, 0 inside or on the edge, float32, shape ``[N, W, W]``; aliases the scratch.
 
     Examples:
-        >>> outside_footprint(window_offsets(2, 1.0), torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0]]), torch.ones(2)).tolist()
+        >>> sensor, box = torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0]])
+        >>> outside_footprint(window_offsets(2, 1.0), sensor, box, torch.ones(2)).tolist()
         [[[1.0, 1.0], [1.0, 0.0]]]
     """
     yaw = sensor_pose[:, 2, None, None]
@@ -321,6 +366,8 @@ def outside_footprint(
     left = offsets - (shift_y * cos - shift_x * sin)
     cos, sin = unit_vector(pose[:, 2, None, None] - yaw)
     half = (size / 2)[..., None, None]
-    along = torch.add(cos * ahead, sin * left).abs_().sub_(half[..., 0, :, :])
-    across = torch.add(-sin * ahead, cos * left).abs_().sub_(half[..., 1, :, :])
-    return torch.maximum(along, across).sign_().relu_()
+    shape = (len(sensor_pose), len(offsets), len(offsets))
+    along, across = scratch or (offsets.new_empty(shape), offsets.new_empty(shape))
+    torch.add(cos * ahead, sin * left, out=along).abs_().sub_(half[..., 0, :, :])
+    torch.add(-sin * ahead, cos * left, out=across).abs_().sub_(half[..., 1, :, :])
+    return torch.maximum(along, across, out=along).sign_().relu_()

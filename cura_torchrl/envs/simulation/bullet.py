@@ -31,17 +31,25 @@ _MAX_RAYS = 8192
 """Rays in one call; Bullet returns nothing for 16,384 numpy rays or more."""
 
 
+_BLOCK = 8
+"""Worlds stepped together between two IK solutions: few enough for their state to stay in the cache, enough to share numpy's overhead."""
+
+
 class SimulationError(RuntimeError):
     """The simulator's state is not finite, or a ray would have lied."""
 
 
 class TorqueLaw(Protocol):
-    """What computes joint torques in each tick; see :class:`cura_torchrl.envs.robots.controller.ImpedanceController`."""
+    """What computes joint torques; see :class:`cura_torchrl.envs.robots.controller.ImpedanceController`."""
 
     ik_ticks: int
 
-    def torques(self, tick: int, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Return joint torques, shape ``[N, J]``, from joint positions and velocities of the same shape."""
+    def solve_ik(self) -> None:
+        """Plan the next ``ik_ticks`` ticks for all worlds."""
+        ...
+
+    def torques(self, rows: slice, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Return joint torques of some worlds, shape ``[B, J]``, from joint positions and velocities of the same shape."""
         ...
 
 
@@ -198,24 +206,32 @@ class BulletWorlds:
             SimulationError: If a state or a torque is not finite.
         """
         self._contact[:] = False
+        for start in range(0, ticks, law.ik_ticks):
+            law.solve_ik()
+            for first in range(0, self.num_worlds, _BLOCK):
+                rows = slice(first, min(first + _BLOCK, self.num_worlds))
+                self._advance_block(law, rows, min(law.ik_ticks, ticks - start))
+            self._note_contacts()
         state = self._joint_state
-        worlds = list(zip(range(self.num_worlds), self._clients, self._robot, self._object, (-self._weight).tolist(), strict=True))
-        index, torque_control, world_frame = self._index, bullet.TORQUE_CONTROL, bullet.WORLD_FRAME
-        for tick in range(ticks):
-            torque = law.torques(tick, state[:, 0], state[:, 1]).tolist()
-            joints = []
-            for world, client, robot, body, weight in worlds:
-                bullet.setJointMotorControlArray(robot, index, torque_control, forces=torque[world], physicsClientId=client)
-                com = bullet.getBasePositionAndOrientation(body, physicsClientId=client)[0]
-                bullet.applyExternalForce(body, -1, (0.0, 0.0, weight), com, world_frame, physicsClientId=client)
-                bullet.stepSimulation(physicsClientId=client)
-                joints.append([entry[:2] for entry in bullet.getJointStates(robot, index, physicsClientId=client)])
-            state[:] = np.array(joints).transpose(0, 2, 1)
-            if (tick + 1) % law.ik_ticks == 0:
-                self._note_contacts()
         if not np.isfinite(state).all():
             msg = f"worlds {np.flatnonzero(~np.isfinite(state).all(axis=(1, 2))).tolist()} have joint states that are not finite"
             raise SimulationError(msg)
+
+    def _advance_block(self, law: TorqueLaw, rows: slice, ticks: int) -> None:
+        state, index = self._joint_state[rows], self._index
+        torque_control, world_frame = bullet.TORQUE_CONTROL, bullet.WORLD_FRAME
+        weights = [(0.0, 0.0, -weight) for weight in self._weight[rows].tolist()]
+        worlds = list(zip(self._clients[rows], self._robot[rows], self._object[rows], weights, strict=True))
+        for _ in range(ticks):
+            torques = law.torques(rows, state[:, 0], state[:, 1]).tolist()
+            joints = []
+            for (client, robot, body, weight), torque in zip(worlds, torques, strict=True):
+                bullet.setJointMotorControlArray(robot, index, torque_control, forces=torque, physicsClientId=client)
+                com = bullet.getBasePositionAndOrientation(body, physicsClientId=client)[0]
+                bullet.applyExternalForce(body, -1, weight, com, world_frame, physicsClientId=client)
+                bullet.stepSimulation(physicsClientId=client)
+                joints.append([entry[:2] for entry in bullet.getJointStates(robot, index, physicsClientId=client)])
+            state[:] = np.array(joints).transpose(0, 2, 1)
 
     def _note_contacts(self) -> None:
         for world, slots in enumerate(self._obstacles):

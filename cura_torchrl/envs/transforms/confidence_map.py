@@ -21,12 +21,12 @@ from cura_torchrl.envs.sensors import visibility
 from cura_torchrl.envs.sensors.visibility import MapGrid
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from tensordict import NestedKey
 
 _CHUNK_CELLS = 2**18
-"""Cells processed at once: bounds the temporaries' memory and keeps them near the cache."""
+"""Cells processed at once: keeps the work space near the cache."""
 
 _MAX_AGE = 2**16
 """Age [steps] at which a cell stops decaying."""
@@ -35,13 +35,13 @@ _MAX_AGE = 2**16
 class ConfidenceMap(Transform):
     """Keep a map of what the LiDAR has seen and write the window around the robot.
 
-    Each cell has a confidence, 1 when observed in this step and else ``decay`` times the last one (paper Eq. (2)), and an
-    occupancy in {0, 1}: what was there when it was last observed, which does not decay. A cell is observed free if its
-    centre is nearer than the range measured at its bearing, less half a cell's diagonal; the cell in which a ray ends on
-    something is observed occupied; all other cells are unseen in this step, and before their first observation both
-    values are 0. The cells of the robot and of the known object are left out of the occupancy: rays that end on the
-    object (or within a cell of its sides, for noise and for the grid) mark the cell as seen without an obstacle, and
-    inside of both footprints the window shows none.
+    Each cell has a confidence, 1 when observed in this step and else ``decay`` times the last one, and an occupancy in
+    {0, 1}: what was there when it was last observed, which does not decay. A cell is observed free if its centre is
+    nearer than the range measured at its bearing (by the nearest ray), less half a cell's diagonal; the cell in which a
+    ray ends on something is observed occupied; all other cells are unseen in this step, and before their first
+    observation both values are 0. The cells of the robot and of the known object are left out of the occupancy: a ray
+    that ends on the object (or within a cell of its sides, for noise and for the grid) marks its cell as seen, without
+    an obstacle, and inside of both footprints the window shows none.
 
     The window ``[*, C, W, W]`` turns with the base: row ``i`` lies at base-frame ``x = (i - (W - 1) / 2) * resolution``
     (ahead of the robot for large ``i``), column ``j`` at base-frame ``y = (j - (W - 1) / 2) * resolution`` (to its left
@@ -57,10 +57,11 @@ class ConfidenceMap(Transform):
     ``confidence_map``     write   Window of the map [1]; channels as in ``config.channels``    ``[*, C, W, W]``
     ====================== ======= ============================================================ ==================
 
-    A reset forgets the rows that are reset and integrates their first scan; in the other rows the window that ``_reset``
-    returns is 0, for TorchRL keeps their old value. Rows never depend on one another. A range that is not a number has
-    seen nothing. Called as a module, outside of an environment, the transform integrates one more scan; it is no
-    transform for a replay buffer, whose samples are in no order. The time of a step grows with the cells of the extent.
+    A reset forgets the rows that are reset and integrates their first scan; in the other rows the window that
+    ``_reset`` returns is 0, for TorchRL keeps their old value. Rows never depend on one another. A range that is not a
+    number has seen nothing; a pose that is not a number raises ``RuntimeError``. Called as a module, outside of an
+    environment, the transform integrates one more scan; it is no transform for a replay buffer, whose samples are in no
+    order. The time of a step grows with the cells of the extent.
 
     Args:
         config: Decay, extent, window and channels.
@@ -99,7 +100,9 @@ class ConfidenceMap(Transform):
         out_key: NestedKey = keys.CONFIDENCE_MAP,
     ) -> None:
         require(len(in_keys) == 2, "in_keys", in_keys, "the keys of the scan and of the sensor's pose")
-        require(object_keys is None or len(object_keys) == 2, "object_keys", object_keys, "None, or two keys: pose and size")
+        require(
+            object_keys is None or len(object_keys) == 2, "object_keys", object_keys, "None, or two keys: pose and size"
+        )
         require(num_rays >= 1 and max_range > 0, "num_rays, max_range", (num_rays, max_range), "positive numbers")
         super().__init__(in_keys=[*in_keys, *(object_keys or ())], out_keys=[out_key])
         self.config = config = MapConfig() if config is None else config
@@ -116,13 +119,15 @@ class ConfidenceMap(Transform):
             "_directions": torch.stack(visibility.unit_vector(bearings)),
             "_powers": _decay_powers(config.decay),
             "_robot_size": torch.tensor(robot_size),
-            "_outside_robot": visibility.outside_footprint(offsets, origin, origin, torch.tensor(robot_size)).flatten(1),
+            "_outside_robot": visibility.outside_footprint(offsets, origin, origin, torch.tensor(robot_size)),
         }
         for name, table in tables.items():
             self.register_buffer(name, table, persistent=False)
-        # +t: seen free in step t of the episode; -t: seen occupied in step t; 0: never seen. Whole numbers, exact below 2**24.
+        # +t: seen free in step t of the episode; -t: seen occupied in step t; 0: never seen. Whole, exact below 2**24.
         self.register_buffer("_stamps", None, persistent=False)
         self.register_buffer("_steps", None, persistent=False)
+        self._map_space: tuple[torch.Tensor, ...] = ()
+        self._window_space: tuple[torch.Tensor, ...] = ()
         self._batch_shape = torch.Size([])
 
     @property
@@ -182,71 +187,95 @@ class ConfidenceMap(Transform):
 
         Raises:
             KeyError: If an in_key is missing.
-            ValueError: If the scan has another number of rays.
         """
         for key in self.in_keys:
             if unravel_key(key) not in observation_spec.keys(include_nested=True, leaves_only=True):
                 msg = f"environment has no {key!r}; accepted: one that emits {self.in_keys}"
                 raise KeyError(msg)
         scan = observation_spec[self.in_keys[0]]
-        require(scan.shape[-1] == self.num_rays, "number of rays of the scan", scan.shape[-1], f"num_rays = {self.num_rays}")
+        require(
+            scan.shape[-1] == self.num_rays, "number of rays of the scan", scan.shape[-1], f"num_rays = {self.num_rays}"
+        )
         shape = (*scan.shape[:-1], self.num_channels, self.config.window, self.config.window)
         observation_spec[self.out_keys[0]] = Bounded(0.0, 1.0, shape=shape, dtype=torch.float32, device=scan.device)
         return observation_spec
 
     def _observe(self, stamps: torch.Tensor, steps: torch.Tensor, inputs: list[torch.Tensor]) -> torch.Tensor:
-        """Integrate one scan into ``stamps`` and ``steps`` in place and return the windows."""
+        """Return the windows after one scan is integrated into ``stamps`` and ``steps``, in place."""
         steps += 1
         scan, pose = visibility.clean_scan(inputs[0], self.max_range), inputs[1]
-        size = max(1, _CHUNK_CELLS // stamps[0].numel()) if len(stamps) else 1
-        for start in range(0, len(stamps), size):
-            rows = slice(start, start + size)
-            free = visibility.seen_free(self._row_x, self._column_y, scan[rows], pose[rows], self.grid.half_diagonal)
+        if not self._map_space or self._map_space[0].device != scan.device:
+            self._allocate(scan.device)
+        for rows, scratch in _chunks(len(scan), self._map_space):
+            free = visibility.seen_free(
+                self._row_x, self._column_y, scan[rows], pose[rows], self.grid.half_diagonal, scratch
+            )
             torch.lerp(stamps[rows], steps[rows, None, None], free, out=stamps[rows])  # exact: the weights are 0 and 1
-        self._mark_hits(stamps.flatten(1), steps[:, None], scan, inputs)
-        return self._window(stamps.flatten(1), steps[:, None], inputs)
+        flat, now = stamps.flatten(1), steps[:, None]
+        self._mark_hits(flat, now, scan, inputs)
+        window = scan.new_empty(len(scan), self.num_channels, self.config.window, self.config.window)
+        for rows, scratch in _chunks(len(scan), self._window_space):
+            self._fill(window[rows], flat[rows], now[rows], [item[rows] for item in inputs], scratch)
+        return window
+
+    def _allocate(self, device: torch.device) -> None:
+        for name, shape, num_floats in (
+            ("_map_space", (self.grid.num_rows, self.grid.num_columns), 1),
+            ("_window_space", (self.config.window, self.config.window), 3),
+        ):
+            count = max(1, _CHUNK_CELLS // (shape[0] * shape[1]))
+            setattr(self, name, visibility.work_space((count, *shape), num_floats, device))
 
     def _mark_hits(
         self, stamps: torch.Tensor, steps: torch.Tensor, scan: torch.Tensor, inputs: list[torch.Tensor]
     ) -> None:
+        x, y = visibility.ray_ends(scan, inputs[1], self._directions)
+        cells, is_inside = visibility.cell_of_points(self.grid, x, y)
         # Half a cell below the maximum is five times the LiDAR's noise: a noisy miss is no obstacle.
-        nearest_miss = self.max_range - 0.5 * self.config.resolution
-        pose = inputs[1]
-        points, is_hit = visibility.hit_points(scan, pose, self._directions, nearest_miss)
-        cells, is_inside = visibility.cell_of_points(self.grid, points)
-        is_known = visibility.inside_rectangle(points, pose, self._robot_size)
+        is_hit = is_inside & (scan > 0.0) & (scan < self.max_range - 0.5 * self.config.resolution)
+        is_obstacle = is_hit & ~visibility.inside_rectangle(x, y, inputs[1], self._robot_size)
         if len(inputs) > 2:
-            is_known |= visibility.inside_rectangle(points, inputs[2], inputs[3], margin=self.config.resolution)
-        is_seen = is_hit & is_inside
-        # What is not to be written goes to cell 0, outside of the extent, as the 0 that is there already. Obstacles come
-        # second: a cell that holds the object and an obstacle is occupied, whatever the order of the rays.
-        stamps.scatter_(1, cells * is_seen, steps * is_seen)
-        is_obstacle = is_seen & ~is_known
+            is_obstacle &= ~visibility.inside_rectangle(x, y, inputs[2], inputs[3], margin=self.config.resolution)
+        # What is not to be written goes to cell 0, outside of the extent, as the 0 that is there already. Obstacles
+        # come second: a cell that holds the object and an obstacle is occupied, whatever the order of the rays.
+        stamps.scatter_(1, cells * is_hit, steps * is_hit)
         stamps.scatter_(1, cells * is_obstacle, -steps * is_obstacle)
 
-    def _window(self, stamps: torch.Tensor, steps: torch.Tensor, inputs: list[torch.Tensor]) -> torch.Tensor:
-        cells = visibility.window_cells(self.grid, self._offsets, inputs[1])
-        stamp = torch.gather(stamps, 1, cells)
-        last_seen = stamp.abs()
-        age = torch.sub(steps, last_seen).clamp_(max=self._powers.numel() - 1).long()
-        confidence = self._powers.index_select(0, age.view(-1)).view(age.shape).mul_(last_seen.clamp_(max=1.0))
-        shape = (len(stamps), -1, self.config.window, self.config.window)
+    def _fill(
+        self,
+        window: torch.Tensor,
+        stamps: torch.Tensor,
+        steps: torch.Tensor,
+        inputs: list[torch.Tensor],
+        scratch: list[torch.Tensor],
+    ) -> None:
+        cells = visibility.window_cells(self.grid, self._offsets, inputs[1], scratch)
+        stamp, last_seen, spare, age = scratch
+        torch.gather(stamps, 1, cells.flatten(1), out=stamp.flatten(1))
+        torch.abs(stamp, out=last_seen)
+        age.copy_(torch.sub(steps[..., None], last_seen, out=spare).clamp_(max=len(self._powers) - 1))
+        torch.index_select(self._powers, 0, age.view(-1), out=spare.view(-1))
+        torch.mul(spare, last_seen.clamp_(max=1.0), out=window[:, 0])
         if self.config.channels == "confidence":
-            return confidence.view(shape)
+            return
         occupancy = stamp.clamp_(-1.0, 0.0).neg_().mul_(self._outside_robot)
         if len(inputs) > 2:
-            occupancy.mul_(visibility.outside_footprint(self._offsets, *inputs[1:]).flatten(1))
+            occupancy.mul_(visibility.outside_footprint(self._offsets, *inputs[1:], scratch[1:3]))
         if self.config.channels == "product":
-            return confidence.mul_(occupancy).view(shape)
-        return torch.stack((confidence, occupancy), 1).view(shape)
+            window[:, 0] *= occupancy
+        else:
+            window[:, 1] = occupancy
 
     def _read(self, tensordict: TensorDictBase) -> list[torch.Tensor]:
-        """Return the inputs with one batch dimension, and note the batch's shape."""
+        # The inputs with one batch dimension; the batch's shape is noted.
         values = [tensordict.get(key) for key in self.in_keys]
         if any(value is None for value in values):
-            msg = f"tensordict has only {sorted(map(str, tensordict.keys(True, True)))}; accepted: one that holds {self.in_keys}"
+            given = sorted(map(str, tensordict.keys(True, True)))
+            msg = f"tensordict has only {given}; accepted: one that holds {self.in_keys}"
             raise KeyError(msg)
-        require(values[0].shape[-1] == self.num_rays, "number of rays", values[0].shape[-1], f"num_rays = {self.num_rays}")
+        require(
+            values[0].shape[-1] == self.num_rays, "number of rays", values[0].shape[-1], f"num_rays = {self.num_rays}"
+        )
         self._batch_shape = values[0].shape[:-1]
         return [value.reshape(-1, value.shape[-1]).float() for value in values]
 
@@ -258,6 +287,14 @@ class ConfidenceMap(Transform):
         reset_keys = ["_reset"] if self.parent is None else self.parent.reset_keys
         require(len(reset_keys) == 1, "reset keys", reset_keys, "environments with one done flag per row")
         return reset_keys[0]
+
+
+def _chunks(num_rows: int, space: tuple[torch.Tensor, ...]) -> Iterator[tuple[slice, list[torch.Tensor]]]:
+    # Slices of the batch that fit the work space, each with its part of it.
+    size = len(space[0])
+    for start in range(0, num_rows, size):
+        count = min(size, num_rows - start)
+        yield slice(start, start + count), [tensor[:count] for tensor in space]
 
 
 def _decay_powers(decay: float) -> torch.Tensor:

@@ -1,0 +1,235 @@
+"""The command line: one subcommand a job, its flags made from the frozen configurations.
+
+Torch, TorchRL and the simulator are imported inside the subcommands, so that help and errors come at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import io
+import json
+import logging
+import os
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
+from cura_torchrl.trainers.errors import RunError
+from cura_torchrl.trainers.info import capabilities, git_commit, hardware, shipped_methods, versions
+from cura_torchrl.trainers.methods import METHODS, method
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+PROGRAM = "cura-torchrl"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """Train a method. The method decides the other flags' defaults; with --resume the run's own configuration does."""
+
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    """The run."""
+    resume: bool = False
+    """Go on from the newest good checkpoint in the run's folder."""
+    init_from: Path | None = None
+    """Run or checkpoint whose networks to start from; optimisers, counters and curriculum start afresh."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """Play frozen scenarios with a trained or scripted policy and count how they end."""
+
+    config: Annotated[EvaluateConfig, tyro.conf.arg(name="")]
+    """Policy and scenarios."""
+    json: bool = False
+    """Print nothing but the result, as JSON."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InfoOptions:
+    """Show versions, hardware, and what works here."""
+
+    json: bool = False
+    """Print JSON."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: Arguments; those of the process if None.
+
+    Returns:
+        Exit code: 0, 2 after a one-line error, 130 and 143 after SIGINT and SIGTERM.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not given or given[0] in {"-h", "--help"}:
+        sys.stdout.write(_overview())
+        return 0
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    if given[0] not in _COMMANDS:
+        return _complain(RunError(f"{given[0]!r} is no command; accepted: {', '.join(_COMMANDS)}"), RunError.exit_code)
+    try:
+        _COMMANDS[given[0]](given[1:])
+    except RunError as error:
+        return _complain(error, error.exit_code)
+    except OSError as error:
+        return _complain(error, RunError.exit_code)
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+def _complain(error: Exception, code: int) -> int:
+    sys.stderr.write(f"{PROGRAM}: {' '.join(str(error).split())}\n")
+    return code
+
+
+def _overview() -> str:
+    lines = [f"  {name:<14}{(command.__doc__ or '').splitlines()[0]}" for name, command in _COMMANDS.items()]
+    usage = f"usage: {PROGRAM} COMMAND [flags]; {PROGRAM} COMMAND --help lists the flags"
+    return "\n".join([usage, "", "commands:", *lines, "", f"methods: {', '.join(METHODS)}", ""])
+
+
+def _train(arguments: list[str]) -> None:
+    """Train a method."""
+    options = _parse(TrainOptions, "train", arguments, TrainOptions(config=_defaults(arguments)))
+    with _clean_stdout():
+        from cura_torchrl.trainers.train import train  # noqa: PLC0415 - see the module's docstring
+
+        _quieten_torchrl()
+        checkpoint = train(options.config, resume=options.resume, init_from=options.init_from)
+    sys.stdout.write(f"{checkpoint}\n")
+
+
+def _evaluate(arguments: list[str]) -> None:
+    """Count how a policy's episodes end."""
+    options = _parse(EvaluateOptions, "evaluate", arguments)
+    with _clean_stdout():
+        from cura_torchrl.trainers.evaluate import evaluate  # noqa: PLC0415 - see the module's docstring
+
+        _quieten_torchrl()
+        result = evaluate(options.config)
+    sys.stdout.write(json.dumps(result, indent=2) + "\n" if options.json else _as_text(result))
+
+
+def _info(arguments: list[str]) -> None:
+    """Show versions, hardware, and what works here."""
+    options = _parse(InfoOptions, "info", arguments)
+    found = {
+        "versions": versions(),
+        "commit": git_commit(),
+        "hardware": hardware(),
+        "works": capabilities(),
+        "shipped methods": shipped_methods(),
+    }
+    sys.stdout.write(json.dumps(found, indent=2) + "\n" if options.json else _as_text(found))
+
+
+def _pretrain_map(arguments: list[str]) -> None:
+    """Train the encoder of confidence maps."""
+    module = importlib.import_module("cura_torchrl.trainers.pretrain_map")
+    _quieten_torchrl()
+    module.pretrain_map(_parse(module.PretrainMapConfig, "pretrain-map", arguments))
+
+
+def _demo(arguments: list[str]) -> None:
+    """Play the shipped policies on the same scenes, and write a page to look at."""
+    module = importlib.import_module("cura_torchrl.trainers.demo")
+    _quieten_torchrl()
+    module.demo(_parse(module.DemoConfig, "demo", arguments))
+
+
+def _defaults(arguments: list[str]) -> TrainConfig:
+    """Return what the flags of ``train`` start from: the method's preset, or the run's own configuration."""
+    scout = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    scout.add_argument("--method")
+    scout.add_argument("--run-dir", "--run_dir", type=Path, default=TrainConfig().run_dir)
+    scout.add_argument("--resume", action="store_true")
+    with _one_line_errors():
+        known, _ = scout.parse_known_args([entry for entry in arguments if entry not in {"-h", "--help"}])
+        preset = method(known.method or TrainConfig().method)
+    if not known.resume:
+        return preset
+    with _clean_stdout():
+        from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config  # noqa: PLC0415 - as above
+
+        config, _ = read_config(find_checkpoint(known.run_dir))
+    return config.replace(run_dir=known.run_dir)
+
+
+def _parse(options: type[Any], command: str, arguments: list[str], default: Any = None) -> Any:
+    # An error is one line in place of tyro's box.
+    printed = io.StringIO()
+    given = {} if default is None else {"default": default}
+    try:
+        with contextlib.redirect_stderr(printed), _one_line_errors():
+            return tyro.cli(options, prog=f"{PROGRAM} {command}", args=arguments, **given)
+    except SystemExit as exit_:
+        if exit_.code in {0, None}:
+            raise
+        raise RunError(_unbox(printed.getvalue())) from None
+
+
+def _unbox(text: str) -> str:
+    """Return the message inside tyro's box."""
+    inside = re.findall(r"^│ ?(.*?) *│$", text, flags=re.MULTILINE)
+    rule = next((index for index, line in enumerate(inside) if line.startswith("───")), len(inside))
+    return " ".join(" ".join(inside[:rule] or [text]).split())
+
+
+@contextlib.contextmanager
+def _one_line_errors() -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, argparse.ArgumentError) as error:
+        raise RunError(str(error)) from None
+
+
+@contextlib.contextmanager
+def _clean_stdout() -> Iterator[None]:
+    """Send what libraries print, C code and worker processes included, to stderr."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+def _quieten_torchrl() -> None:
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+
+
+def _as_text(result: dict[str, Any], indent: str = "") -> str:
+    lines = []
+    for name, value in result.items():
+        if isinstance(value, dict):
+            lines.append(f"{indent}{name}:\n{_as_text(value, indent + '  ')}".rstrip("\n"))
+        else:
+            shown = f"{value:.4g}" if isinstance(value, float) else value
+            lines.append(f"{indent}{name}: {', '.join(value) if isinstance(value, list) else shown}")
+    return "\n".join(lines) + "\n"
+
+
+_COMMANDS: dict[str, Callable[[list[str]], None]] = {
+    "pretrain-map": _pretrain_map,
+    "train": _train,
+    "evaluate": _evaluate,
+    "demo": _demo,
+    "info": _info,
+}
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,244 @@
+"""Play frozen scenarios with a fixed policy and count how they end."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import multiprocessing
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from tqdm import tqdm
+
+from cura_torchrl import keys
+from cura_torchrl.envs.config import PushEnvConfig
+from cura_torchrl.envs.push import PushEnv
+from cura_torchrl.envs.robots import scripted
+from cura_torchrl.trainers.checkpoint import load_policy
+from cura_torchrl.trainers.info import git_commit, versions
+from cura_torchrl.trainers.statistics import wilson_interval
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from tensordict import TensorDictBase
+    from torchrl.envs import EnvBase
+
+    from cura_torchrl.envs.config import TaskConfig
+    from cura_torchrl.trainers.config import EvaluateConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """How one scenario was played."""
+
+    index: int
+    """Index of the scenario in its stream [1]."""
+    success: tuple[bool, ...]
+    """Goal reached before any collision, for each tolerance."""
+    collision: bool
+    """Ended in a collision before the goal was reached."""
+    contact: tuple[bool, bool, bool]
+    """Whether base, arm, object touched an obstacle in the collision."""
+    tipped: bool
+    """The object tipped over."""
+    steps: int
+    """Policy steps until goal, collision or time-out [1]."""
+
+
+def evaluate(config: EvaluateConfig) -> dict[str, Any]:
+    """Play the scenarios and return the counts.
+
+    Args:
+        config: Policy, scenarios and their number.
+
+    Returns:
+        JSON-compatible result; rates with Wilson's 95 % interval.
+
+    Raises:
+        CheckpointError: If the policy's checkpoint is missing or damaged.
+    """  # noqa: DOC502 - raised by what this calls
+    source = _source(config)
+    with tqdm(total=config.episodes, unit="episode", file=sys.stderr) as bar:
+        episodes: list[Episode] = []
+        for played in _play_all(config):
+            episodes += played
+            bar.update(len(played))
+            bar.set_postfix_str(f"success {sum(episode.success[0] for episode in episodes) / len(episodes):.1%}")
+    return {**source, **summarise(episodes), **_settings(config)}
+
+
+def summarise(episodes: list[Episode]) -> dict[str, Any]:
+    """Return counts and rates.
+
+    Args:
+        episodes: What was played, at least one.
+
+    Returns:
+        Counts, success rates for the three tolerances, Wilson's interval of the headline, mean steps to the outcome.
+    """
+    count = len(episodes)
+    successes = sum(episode.success[0] for episode in episodes)
+    collisions = [episode for episode in episodes if episode.collision]
+    low, high = wilson_interval(successes, count)
+    return {
+        "episodes": count,
+        "successes": successes,
+        "success_rate": successes / count,
+        "wilson_low": low,
+        "wilson_high": high,
+        "collisions": len(collisions),
+        "timeouts": count - successes - len(collisions),
+        "success_rate_025": sum(episode.success[1] for episode in episodes) / count,
+        "success_rate_010_10deg": sum(episode.success[2] for episode in episodes) / count,
+        "mean_steps": sum(episode.steps for episode in episodes) / count,
+        "tipped": sum(episode.tipped for episode in episodes),
+        "collisions_by": {
+            name: sum(episode.contact[index] for episode in collisions)
+            for index, name in enumerate(("base", "arm", "object"))
+        },
+    }
+
+
+class Player:
+    """A policy and the worlds that it plays in.
+
+    Args:
+        config: Policy and scenarios.
+    """
+
+    def __init__(self, config: EvaluateConfig) -> None:
+        self._config = config
+        self._env, self._policy = _build(config)
+
+    def close(self) -> None:
+        """Close the worlds."""
+        self._env.close()
+
+    @torch.no_grad()
+    def play(self, chunk: int) -> list[Episode]:
+        """Play one chunk of scenarios, each once.
+
+        Args:
+            chunk: Index of the chunk.
+
+        Returns:
+            Its episodes in order; the last chunk's surplus is left out.
+        """
+        size = self._config.chunk
+        first = chunk * size
+        torch.manual_seed(self._config.seed * 1_000_003 + chunk)  # random actions only; all else is deterministic
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            episodes = self._play(torch.arange(first, first + size))
+        return episodes[: self._config.episodes - first]
+
+    def _play(self, indices: torch.Tensor) -> list[Episode]:
+        state = self._env.reset(episodes=indices)
+        outcomes: dict[int, Episode] = {}
+        reached = torch.zeros(len(indices), dtype=torch.int64)
+        is_over = torch.zeros(len(indices), dtype=torch.bool)
+        while not is_over.all():
+            state = self._policy(state)
+            # A world that is over stands still until the others are: what happens there no longer counts.
+            state[keys.ACTION] = torch.where(is_over.unsqueeze(-1), 0.0, state[keys.ACTION])
+            after = self._env.step(state)["next"]
+            steps = after[keys.ELAPSED_STEPS].squeeze(-1)
+            is_new = after[keys.SUCCESS][:, 0] & (reached == 0)
+            reached = torch.where(is_new, steps, reached)
+            ended = after["done"].squeeze(-1) & ~is_over
+            for row in ended.nonzero().flatten().tolist():
+                outcomes[row] = _episode(int(indices[row]), after[row], int(reached[row]))
+            is_over |= ended
+            state = step_mdp(state)
+        return [outcomes[row] for row in range(len(indices))]
+
+
+def _episode(index: int, last: TensorDictBase, reached: int) -> Episode:
+    success = tuple(last[keys.SUCCESS].tolist())
+    contact = tuple(last[keys.CONTACT].tolist())
+    return Episode(
+        index=index,
+        success=success,
+        collision=bool(last["terminated"]) and not success[0],
+        contact=contact,
+        tipped=bool(last[keys.TIPPED]),
+        steps=reached or int(last[keys.ELAPSED_STEPS]),
+    )
+
+
+def _play_all(config: EvaluateConfig) -> Iterator[list[Episode]]:
+    chunks = range(-(-config.episodes // config.chunk))
+    if config.num_workers == 1:
+        with closing(Player(config)) as player:
+            yield from map(player.play, chunks)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(config.num_workers, len(chunks)), mp_context=context) as pool:
+        yield from pool.map(functools.partial(_play_in_worker, config), chunks)
+
+
+def _play_in_worker(config: EvaluateConfig, chunk: int) -> list[Episode]:
+    torch.set_num_threads(1)
+    return _worker_player(config).play(chunk)
+
+
+@functools.lru_cache(maxsize=1)
+def _worker_player(config: EvaluateConfig) -> Player:
+    return Player(config)
+
+
+def _build(config: EvaluateConfig) -> tuple[EnvBase, Callable[[TensorDictBase], TensorDictBase]]:
+    """Return the worlds and who plays in them."""
+    if config.policy is None:
+        loaded = load_policy(_path(config))
+        env = loaded.make_env(config.chunk, task=_task(loaded.config.env.task, config), seed=config.seed)
+        return env, loaded.policy
+    base = PushEnvConfig(simulator=config.simulator)
+    task = dataclasses.replace(_task(base.task, config), privileged=config.policy == "avoider")
+    env = PushEnv(config.chunk, dataclasses.replace(base, task=task), seed=config.seed)
+    if config.policy == "random":
+        return env, env.rand_action
+    return env, (scripted.ScriptedPusher if config.policy == "scripted" else scripted.ScriptedAvoider)(base.robot)
+
+
+def _path(config: EvaluateConfig) -> str | Path:
+    return config.method if config.method is not None else Path(config.checkpoint or "")
+
+
+def _source(config: EvaluateConfig) -> dict[str, Any]:
+    """Return who plays; raises before any world is built."""
+    if config.policy is not None:
+        return {"method": config.policy, "checkpoint": None, "trained_frames": 0}
+    loaded = load_policy(_path(config))
+    return {
+        "method": loaded.config.method,
+        "checkpoint": loaded.path.as_posix(),
+        "trained_frames": loaded.record["frames"],
+        "trained_commit": loaded.record["commit"],
+    }
+
+
+def _task(task: TaskConfig, config: EvaluateConfig) -> TaskConfig:
+    scenario = dataclasses.replace(
+        task.scenario, kind=config.scenario, object_edges=(config.object_size,), max_obstacles=config.max_obstacles
+    )
+    return dataclasses.replace(task, scenario=scenario, stream="eval", random_first_age=False, curriculum=())
+
+
+def _settings(config: EvaluateConfig) -> dict[str, Any]:
+    return {
+        "scenario": config.scenario,
+        "object_size": config.object_size,
+        "max_obstacles": config.max_obstacles,
+        "seed": config.seed,
+        "chunk": config.chunk,
+        "simulator": config.simulator,
+        "commit": git_commit(),
+        "versions": versions(),
+    }

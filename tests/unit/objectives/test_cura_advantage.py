@@ -1,0 +1,274 @@
+"""Advantage and targets of a rollout."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.objectives.value import GAE
+
+from cura_torchrl.modules import DistributionalCollisionEstimator, make_critic
+from cura_torchrl.objectives import CURAAdvantage
+
+ENVS, STEPS = 6, 16
+
+
+def _networks() -> tuple[TensorDictModule, DistributionalCollisionEstimator]:
+    torch.manual_seed(1)
+    return make_critic(5, hidden_sizes=(16,)), DistributionalCollisionEstimator(5, num_atoms=10, hidden_sizes=(16,))
+
+
+def _rollout(seed: int = 0) -> TensorDict:
+    torch.manual_seed(seed)
+
+    def seen() -> dict[str, torch.Tensor]:
+        return {"observation": torch.randn(ENVS, STEPS, 3), "latent": torch.randn(ENVS, STEPS, 2)}
+
+    terminated = torch.rand(ENVS, STEPS, 1) < 0.1
+    done = terminated | (torch.rand(ENVS, STEPS, 1) < 0.1)
+    signals = {"reward": torch.randn(ENVS, STEPS, 1), "cost": terminated.float()}
+    return TensorDict({**seen(), "next": {**seen(), **signals, "done": done, "terminated": terminated}}, [ENVS, STEPS])
+
+
+class _Table(nn.Module):
+    """An estimator whose risk and uncertainty are read off the observation: two atoms at r +- sqrt(u)."""
+
+    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        risk, uncertainty = observation[..., :1], observation[..., 1:]
+        return torch.cat([risk - uncertainty.sqrt(), risk + uncertainty.sqrt()], -1), risk, uncertainty
+
+
+def _table() -> TensorDictModule:
+    return TensorDictModule(_Table(), in_keys=["observation"], out_keys=["collision_atoms", "risk", "uncertainty"])
+
+
+def _zero_critic() -> TensorDictModule:
+    critic = nn.Linear(2, 1)
+    nn.init.zeros_(critic.weight)
+    nn.init.zeros_(critic.bias)
+    return TensorDictModule(critic, in_keys=["observation"], out_keys=["state_value"])
+
+
+def _table_rollout() -> TensorDict:
+    """One row of three steps: (R, U) = (0.2, 0.04), (0.4, 0.16), (0.5, 0.09), collision, seen as (0.9, 0.01)."""
+    states = torch.tensor([[[0.2, 0.04], [0.4, 0.16], [0.5, 0.09], [0.9, 0.01]]])
+    end = torch.tensor([[[False], [False], [True]]])
+    signals = {"reward": torch.tensor([[[1.0], [2.0], [6.0]]]), "cost": end.float(), "done": end, "terminated": end}
+    return TensorDict({"observation": states[:, :3], "next": {"observation": states[:, 1:], **signals}}, [1, 3])
+
+
+@pytest.mark.parametrize("scale", ["raw", "zscore"])
+def test_without_costs_it_is_gae_to_the_last_bit(scale: str) -> None:
+    """Catches any difference from plain PPO in the methods without costs: they must be TorchRL's z-scored GAE."""
+    critic, estimator = _networks()
+    ours = CURAAdvantage(critic, estimator, risk_coeff=0.0, uncertainty_coeff=0.0, advantage_scale=scale)(_rollout())
+    theirs = GAE(gamma=0.99, lmbda=0.95, value_network=critic, average_gae=True)(_rollout())
+    for key in ("advantage", "value_target", "state_value", ("next", "state_value")):
+        assert torch.equal(ours[key], theirs[key]), key
+
+
+def test_without_costs_a_broken_estimator_changes_nothing() -> None:
+    """Catches 0 * NaN in the policy's advantage of methods that do not use the costs."""
+    critic, estimator = _networks()
+    clean = CURAAdvantage(critic, estimator, risk_coeff=0.0, uncertainty_coeff=0.0)(_rollout())["advantage"]
+    with torch.no_grad():
+        next(estimator.parameters()).fill_(float("nan"))
+    broken = CURAAdvantage(critic, estimator, risk_coeff=0.0, uncertainty_coeff=0.0)(_rollout())
+    assert torch.equal(broken["advantage"], clean)
+
+
+def test_the_penalised_advantage_is_the_one_worked_out_by_hand() -> None:
+    """Catches a wrong sign, coefficient, mask or order of normalisation, by the paper's Eq. (7) to (9).
+
+    gamma = lmbda = 0 and V = 0, so A = r = 1, 2, 6.
+    C^R = 0.9 * 0.4 - 0.2, 0.9 * 0.5 - 0.4, 1 - 0.5 = 0.16, 0.05, 0.5; C^U = 0.12, -0.07, and none at the collision.
+    """
+    estimate = CURAAdvantage(_zero_critic(), _table(), gamma=0.0, lmbda=0.0, normalise_sum=False)
+    risk_cost = torch.tensor([0.16, 0.05, 0.5], dtype=torch.float64)
+    risk_cost = (risk_cost - risk_cost.mean()) / risk_cost.std(correction=0)
+    # Mean 0.025, deviation 0.095: +1 and -1.
+    uncertainty_cost = torch.tensor([1.0, -1.0, 0.0], dtype=torch.float64)
+    expected = torch.tensor([1.0, 2.0, 6.0], dtype=torch.float64) - 0.25 * risk_cost - 1.0 * uncertainty_cost
+    advantage = estimate(_table_rollout())["advantage"].flatten().double()
+    assert torch.allclose(advantage, expected, atol=1e-5)
+
+
+def test_the_sum_is_standardised_for_the_optimiser() -> None:
+    """Catches a sum that keeps the scale of the reward, on which PPO's step size would depend."""
+    critic, estimator = _networks()
+    plain = CURAAdvantage(critic, estimator, normalise_sum=False)(_rollout())["advantage"]
+    advantage = CURAAdvantage(critic, estimator)(_rollout())["advantage"]
+    assert torch.allclose(advantage, (plain - plain.mean()) / plain.std(), atol=1e-6)
+
+
+def test_zscore_scales_the_advantage_before_the_costs() -> None:
+    """Catches an option without effect: with the reward times 100 the costs keep their share."""
+    critic, estimator = _zero_critic(), _table()
+    base, scaled = _table_rollout(), _table_rollout()
+    scaled["next", "reward"] *= 100.0
+    for scale, same in (("zscore", True), ("raw", False)):
+        estimate = CURAAdvantage(critic, estimator, advantage_scale=scale)
+        a, b = estimate(base.clone())["advantage"], estimate(scaled.clone())["advantage"]
+        assert torch.allclose(a, b, atol=1e-5) == same
+
+
+def test_targets_use_the_true_last_observation_and_the_collision() -> None:
+    """Catches a bootstrap from the root of the next step, which belongs to another episode after a reset.
+
+    One step (lambda 0): 0.9 * (0.4 -+ 0.4), 0.9 * (0.5 -+ 0.3), then the collision's 1.
+    """
+    rollout = CURAAdvantage(_zero_critic(), _table(), collision_lmbda=0.0)(_table_rollout())
+    expected = torch.tensor([[[0.0, 0.72], [0.18, 0.72], [1.0, 1.0]]])
+    assert torch.allclose(rollout["collision_target"], expected, atol=1e-6)
+
+
+def test_a_truncated_step_bootstraps_and_keeps_its_costs() -> None:
+    """Catches a time limit that is treated like a collision: 0.9 * 0.9 - 0.5 = 0.31 and not -0.5."""
+    rollout = _table_rollout()
+    rollout["next", "terminated"] = torch.zeros(1, 3, 1, dtype=torch.bool)
+    rollout["next", "cost"] = torch.zeros(1, 3, 1)
+    estimate = CURAAdvantage(_zero_critic(), _table(), collision_lmbda=1.0)
+    out = estimate(rollout)
+    # Bootstrap 0.9 * (0.9 -+ 0.1) at the end, and 0.9 of that before.
+    assert torch.allclose(out["collision_target"][0, 2], torch.tensor([0.72, 0.90]), atol=1e-6)
+    assert torch.allclose(out["collision_target"][0, 1], torch.tensor([0.648, 0.81]), atol=1e-6)
+    # C^U = 0.12, -0.07, -0.08: mean -0.01, deviation sqrt((0.13^2 + 0.06^2 + 0.07^2) / 3) = 0.0920
+    assert estimate.diagnostics(out)["uncertainty_cost_std"].item() == pytest.approx(0.0920, abs=1e-4)
+
+
+def test_coefficients_can_be_set_and_are_saved() -> None:
+    """Catches a warm-up that has no effect because an attribute shadows the buffer."""
+    critic, estimator = _networks()
+    estimate = CURAAdvantage(critic, estimator, risk_coeff=0.0, uncertainty_coeff=0.0)
+    cold = estimate(_rollout())["advantage"]
+    estimate.risk_coeff, estimate.uncertainty_coeff = 0.25, 1
+    warm = estimate(_rollout())["advantage"]
+    assert not torch.allclose(cold, warm)
+    assert torch.equal(warm, CURAAdvantage(critic, estimator)(_rollout())["advantage"])
+    assert estimate.state_dict()["risk_coeff"].item() == 0.25
+
+
+def test_a_resumed_run_draws_the_same_targets() -> None:
+    """Catches a generator that starts again after loading: targets of the second rollout must be equal."""
+    first, resumed = CURAAdvantage(*_networks(), seed=3), CURAAdvantage(*_networks(), seed=4)
+    first(_rollout())
+    resumed.load_state_dict(first.state_dict())
+    assert torch.equal(first(_rollout(1))["collision_target"], resumed(_rollout(1))["collision_target"])
+    fresh = CURAAdvantage(*_networks(), seed=3)(_rollout(1))["collision_target"]
+    assert not torch.equal(fresh, first(_rollout(1))["collision_target"])
+
+
+def test_padding_counts_for_nothing() -> None:
+    """Catches padded steps in the statistics or leaking into targets: results equal those of the unpadded rollout."""
+    estimate = CURAAdvantage(*_networks(), collision_lmbda=1.0)
+    short = _rollout()[:, :10].clone()
+    short["next", "terminated"][:, -1] = True
+    short["next", "done"][:, -1] = True
+    expected = estimate(short.clone())
+    padded = torch.cat([short, _rollout(1)[:, 10:]], 1)
+    padded["next", "reward"][:, 10:] = 1e3
+    padded["next", "terminated"][:, 10:] = False
+    padded["next", "done"][:, 10:] = False
+    padded["collector", "mask"] = (torch.arange(STEPS) < 10).expand(ENVS, STEPS)
+    out = estimate(padded)
+    # The masked z-score divides by the population's deviation, GAE's by the sample's: n = 60.
+    assert torch.allclose(out["advantage"][:, :10] * (59 / 60) ** 0.5, expected["advantage"], atol=1e-4)
+    assert torch.count_nonzero(out["advantage"][:, 10:]) == 0
+    assert torch.allclose(out["collision_target"][:, :10], expected["collision_target"])
+
+
+def test_padding_after_an_open_trajectory_does_not_reach_its_targets() -> None:
+    """Catches a trace that runs on from a trajectory's last step, which is not done, into its padding."""
+    estimate = CURAAdvantage(*_networks(), collision_lmbda=1.0)
+    rollout = _rollout()
+    for flag in ("done", "terminated"):
+        rollout["next", flag] = torch.zeros(ENVS, STEPS, 1, dtype=torch.bool)
+    expected = estimate(rollout[:, :10].clone())["collision_target"]
+    rollout["next", "cost"][:, 10:] = 1.0
+    rollout["collector", "mask"] = (torch.arange(STEPS) < 10).expand(ENVS, STEPS).unsqueeze(-1)
+    assert torch.allclose(estimate(rollout)["collision_target"][:, :10], expected)
+
+
+def test_keys_can_be_nested() -> None:
+    """Catches a hard-coded key anywhere between GAE, costs and targets."""
+    critic, estimator = _networks()
+    expected = CURAAdvantage(critic, estimator)(_rollout())
+    estimate = CURAAdvantage(critic, estimator)
+    estimate.set_keys(
+        cost=("signal", "c"), reward=("signal", "r"), advantage=("out", "a"), collision_target=("out", "t")
+    )
+    moved = _rollout()
+    moved["next"].rename_key_("cost", ("signal", "c")).rename_key_("reward", ("signal", "r"))
+    out = estimate(moved)
+    assert torch.equal(out["out", "a"], expected["advantage"])
+    assert torch.equal(out["out", "t"], expected["collision_target"])
+    assert ("next", "signal", "c") in estimate.in_keys
+    assert ("out", "a") in estimate.out_keys
+    with pytest.raises(ValueError, match="'quantiles' is not a key of CURAAdvantage"):
+        estimate.set_keys(quantiles="q")
+
+
+def test_in_and_out_keys_are_exact() -> None:
+    """Catches keys that are read or written without being listed."""
+    estimate = CURAAdvantage(*_networks())
+    rollout = _rollout()
+    before = set(rollout.keys(True, True))
+    assert set(estimate.in_keys) == before
+    estimate(rollout)
+    assert set(rollout.keys(True, True)) - before == set(estimate.out_keys)
+    assert len(estimate.out_keys) == len(set(estimate.out_keys))
+
+
+def test_keyword_tensors_give_the_same_as_a_tensordict() -> None:
+    """Catches a forward that is not dispatched."""
+    rollout = _rollout()
+    out = CURAAdvantage(*_networks())(rollout.clone())
+    estimate = CURAAdvantage(*_networks())
+    flat = {"_".join(key) if isinstance(key, tuple) else key: rollout[key] for key in estimate.in_keys}
+    for value, key in zip(estimate(**flat), estimate.out_keys, strict=True):
+        assert torch.equal(value, out[key]), key
+
+
+def test_nothing_of_it_carries_a_gradient() -> None:
+    """Catches a graph of the whole rollout that is kept alive until the next one."""
+    rollout = CURAAdvantage(*_networks())(_rollout())
+    assert not any(value.requires_grad for value in rollout.values(True, True))
+
+
+def test_diagnostics_are_the_numbers_they_say() -> None:
+    """Catches a weight taken before normalisation, or statistics over terminal steps; see the hand-worked rollout."""
+    estimate = CURAAdvantage(_zero_critic(), _table(), gamma=0.0, lmbda=0.0, collision_lmbda=0.0)
+    rollout = estimate(_table_rollout())
+    before = rollout.clone()
+    numbers = {name: value.item() for name, value in estimate.diagnostics(rollout).items()}
+    assert all(torch.equal(before[key], rollout[key]) for key in before.keys(True, True))
+    # C^R = 0.16, 0.05, 0.5: mean 0.23667, deviation 0.19155. C^U = 0.12, -0.07: deviation 0.095.
+    assert numbers["risk_cost_std"] == pytest.approx(0.19155, abs=1e-4)
+    assert numbers["uncertainty_cost_std"] == pytest.approx(0.095, abs=1e-5)
+    # A = 1, 2, 6: deviation sqrt(14 / 3). Normalised costs: deviation 1, and sqrt(2 / 3) with the terminal zero.
+    assert numbers["risk_weight"] == pytest.approx(0.25 / (14 / 3) ** 0.5, abs=1e-5)
+    assert numbers["uncertainty_weight"] == pytest.approx((2 / 3) ** 0.5 / (14 / 3) ** 0.5, abs=1e-5)
+    # R = 0.2, 0.4, 0.5 and U = 0.04, 0.16, 0.09: covariance 0.0035556, deviations 0.124722 and 0.049216.
+    assert numbers["risk_uncertainty_correlation"] == pytest.approx(0.0035556 / (0.124722 * 0.049216), abs=1e-4)
+    assert numbers["risk_mean"] == pytest.approx(1.1 / 3)
+    assert numbers["uncertainty_mean"] == pytest.approx(0.29 / 3)
+    # 2 E|x - y| - E|x - x'| - E|y - y'| of the atoms (0, 0.4), (0, 0.8), (0.2, 0.8) and the targets (0, 0.72),
+    # (0.18, 0.72), (1, 1): 0.72 - 0.2 - 0.36 = 0.16; 0.8 - 0.4 - 0.27 = 0.13; 1 - 0.3 - 0 = 0.7.
+    assert numbers["energy_distance"] == pytest.approx((0.16 + 0.13 + 0.7) / 3, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"gamma": 1.1}, "gamma is 1.1; accepted: 0 to 1"),
+        ({"collision_lmbda": -0.1}, "collision_lmbda is -0.1; accepted: 0 to 1"),
+        ({"risk_floor": 0.0}, "risk_floor is 0.0; accepted: a positive number"),
+        ({"advantage_scale": "none"}, "advantage_scale is 'none'; accepted: 'raw', 'zscore'"),
+    ],
+)
+def test_nonsense_is_refused(kwargs: dict[str, object], message: str) -> None:
+    """Catches a misspelt option that silently means the other one, and a division by zero."""
+    with pytest.raises(ValueError, match=message):
+        CURAAdvantage(*_networks(), **kwargs)
