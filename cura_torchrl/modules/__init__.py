@@ -12,11 +12,13 @@ from cura_torchrl.modules.functional import (
     quantile_midpoints,
     wang_risk,
 )
+from cura_torchrl.modules.map_vae import MapVAE
 from cura_torchrl.modules.mlp import ObservationMLP
 from cura_torchrl.modules.observation_norm import ObservationNorm
 
 __all__ = [
     "DistributionalCollisionEstimator",
+    "MapVAE",
     "ObservationMLP",
     "ObservationNorm",
     "atom_mean",

@@ -39,6 +39,18 @@ class _GaussianHead(nn.Module):
         return loc, (self.min_std + self.log_excess.exp()).expand_as(loc)
 
 
+class _Scaled(nn.Module):
+    """A network whose output is multiplied by a constant."""
+
+    def __init__(self, trunk: nn.Module, scale: float) -> None:
+        super().__init__()
+        self.trunk = trunk
+        self.scale = scale
+
+    def forward(self, *inputs: torch.Tensor) -> torch.Tensor:
+        return self.scale * self.trunk(*inputs)
+
+
 def make_actor(
     in_features: int,
     action_dim: int,
@@ -106,6 +118,7 @@ def make_critic(
     hidden_sizes: Sequence[int] = (256, 128, 64),
     activation: Callable[[], nn.Module] = nn.ELU,
     observation_norm: ObservationNorm | None = None,
+    scale: float = 1.0,
     in_keys: Sequence[NestedKey] = (keys.OBSERVATION, keys.LATENT),
     out_key: NestedKey = keys.STATE_VALUE,
 ) -> ValueOperator:
@@ -116,6 +129,8 @@ def make_critic(
         hidden_sizes: Sizes of the hidden layers [1].
         activation: Module class between layers.
         observation_norm: Normalisation of the first input, shared by reference.
+        scale: What the network's output is multiplied by, the magnitude of the returns: the network then learns numbers
+            of order one.
         in_keys: Keys of the inputs, the observation first.
         out_key: Key of the value.
 
@@ -130,4 +145,4 @@ def make_critic(
         in_features, 1, hidden_sizes=hidden_sizes, activation=activation, observation_norm=observation_norm
     )
     orthogonal_init_(trunk, hidden_gain=math.sqrt(2.0), last_gain=1.0)
-    return ValueOperator(trunk, in_keys=list(in_keys), out_keys=[out_key])
+    return ValueOperator(_Scaled(trunk, scale), in_keys=list(in_keys), out_keys=[out_key])

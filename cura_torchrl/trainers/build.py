@@ -54,7 +54,10 @@ class Networks(nn.Module):
             observation_norm=self.observation_norm,
         )
         self.critic = make_critic(
-            inputs, hidden_sizes=sizes.critic_hidden_sizes, observation_norm=self.observation_norm
+            inputs,
+            hidden_sizes=sizes.critic_hidden_sizes,
+            observation_norm=self.observation_norm,
+            scale=config.ppo.value_scale,
         )
         self.collision_estimator = DistributionalCollisionEstimator(
             inputs,
@@ -62,6 +65,15 @@ class Networks(nn.Module):
             hidden_sizes=sizes.collision_hidden_sizes,
             observation_norm=self.observation_norm,
         )
+        for network in (self.actor, self.critic, self.collision_estimator):
+            _ignore_latent_(network)
+
+
+def _ignore_latent_(network: nn.Module) -> None:
+    """Let a network start without regard to the map's code: what was learned without a map goes on unharmed with one."""
+    first = next(layer for layer in network.modules() if isinstance(layer, nn.Linear))
+    with torch.no_grad():
+        first.weight[:, OBSERVATION_SIZE:] = 0.0
 
 
 def build_advantage(config: TrainConfig, networks: Networks) -> CURAAdvantage:
@@ -109,8 +121,8 @@ def build_loss(config: TrainConfig, networks: Networks) -> CURALoss:
         networks.collision_estimator,
         clip_epsilon=config.ppo.clip_epsilon,
         entropy_coeff=config.ppo.entropy_coeff,
-        critic_coeff=config.ppo.critic_coeff,
-        loss_critic_type="smooth_l1",
+        critic_coeff=config.ppo.critic_coeff / config.ppo.value_scale**2,
+        loss_critic_type="l2",
         normalize_advantage=False,
     )
 
@@ -218,6 +230,7 @@ def build_collector(
     if config.num_workers == 1:
         collector = Collector(factories[0], policy, **options)
     else:
+        policy.share_memory()
         collector = Collector(
             factories, policy, sync=True, backend="process", backend_options={"cat_results": 0}, **options
         )

@@ -141,6 +141,14 @@ def _pretrain_map(arguments: list[str]) -> None:
     module.pretrain_map(_parse(module.PretrainMapConfig, "pretrain-map", arguments))
 
 
+def _imitate(arguments: list[str]) -> None:
+    """Warm-start the networks of every method by imitating the scripted pusher."""
+    module = importlib.import_module("cura_torchrl.trainers.imitate")
+    _quieten_torchrl()
+    checkpoint = module.imitate(_parse(module.ImitateConfig, "imitate", arguments))
+    sys.stdout.write(f"{checkpoint}\n")
+
+
 def _demo(arguments: list[str]) -> None:
     """Play the shipped policies on the same scenes, and write a page to look at."""
     module = importlib.import_module("cura_torchrl.trainers.demo")
@@ -225,6 +233,7 @@ def _as_text(result: dict[str, Any], indent: str = "") -> str:
 
 _COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "pretrain-map": _pretrain_map,
+    "imitate": _imitate,
     "train": _train,
     "evaluate": _evaluate,
     "demo": _demo,

@@ -40,6 +40,10 @@ class PPOConfig:
     """Weight of the entropy bonus [1]."""
     critic_coeff: float = 1.0
     """Weight of the critic's loss [1]."""
+    critic_warmup_frames: int = 0
+    """Frames for which only critic and estimator learn [1]: an actor that starts trained is not led by an untrained critic."""
+    value_scale: float = 100.0
+    """Magnitude of the returns [1]: the critic's network and its squared error are in units of it."""
     max_grad_norm: float = 1.0
     """Norm that the gradient of actor and critic is clipped to [1]."""
     lr: float = 1e-3
@@ -57,9 +61,17 @@ class PPOConfig:
         require_finite(self)
         for name in ("gamma", "lmbda"):
             require(0.0 <= getattr(self, name) <= 1.0, name, getattr(self, name), "0 to 1")
-        for name in ("clip_epsilon", "epochs", "minibatch_size", "rollout_steps", "max_grad_norm", "min_lr"):
+        for name in (
+            "clip_epsilon",
+            "epochs",
+            "minibatch_size",
+            "rollout_steps",
+            "max_grad_norm",
+            "min_lr",
+            "value_scale",
+        ):
             require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
-        for name in ("entropy_coeff", "critic_coeff", "target_kl"):
+        for name in ("entropy_coeff", "critic_coeff", "target_kl", "critic_warmup_frames"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "a number that is not negative")
         require(self.min_lr <= self.lr <= self.max_lr, "lr", self.lr, f"min_lr {self.min_lr} to max_lr {self.max_lr}")
         require(self.lr_factor > 1.0, "lr_factor", self.lr_factor, "a number larger than 1")

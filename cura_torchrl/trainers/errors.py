@@ -20,6 +20,10 @@ class NonFiniteError(RunError, ArithmeticError):
     """A number that must be finite is not; the run stopped in that step."""
 
 
+class WorkerError(RunError):
+    """A process that collects has died."""
+
+
 class UnavailableError(RunError):
     """A part that was asked for is not installed or not there."""
 

@@ -143,6 +143,8 @@ class Learner:
         if not torch.isfinite(total):
             bad = ", ".join(name for name, value in terms.items() if not torch.isfinite(value).all())
             raise NonFiniteError(f"{bad} is not finite at {self.frames} frames; the last checkpoint is intact")
+        if self.frames < self._config.ppo.critic_warmup_frames:
+            total = total - losses["loss_objective"] - losses["loss_entropy"]
         self._optimizer.zero_grad(set_to_none=True)
         self._collision_optimizer.zero_grad(set_to_none=True)
         total.backward()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import fcntl
 import logging
 import signal
@@ -28,7 +29,7 @@ from cura_torchrl.trainers.diagnostics import (
     finished_episodes,
     rollout_statistics,
 )
-from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NonFiniteError
+from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NonFiniteError, WorkerError
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.progress import Progress
 
@@ -97,6 +98,9 @@ class _Run:
         torch.set_num_threads(config.learner_threads)
         torch.manual_seed(config.seed)
         self.learner = Learner(config, Networks(config))
+        networks = self.learner.networks
+        # The environments stay on the CPU, and so does the policy that acts in them.
+        self.policy = networks.actor if config.device == "cpu" else copy.deepcopy(networks.actor).cpu()
         self.components = {**self.learner.components(), "rng": GlobalRNGState()}
         self.saved_at = time.monotonic()
         source = self._source(resume)
@@ -104,8 +108,9 @@ class _Run:
             restore(source, self.components)
         elif init_from is not None:
             start = find_checkpoint(init_from)
-            restore(start, {"networks": self.learner.networks})
+            restore(start, {"networks": networks})
             logger.info("networks start from %s", start)
+        self.sync()
 
     def _source(self, resume: bool) -> Path | None:
         # The checkpoint to go on from, or None for a run that starts.
@@ -131,7 +136,7 @@ class _Run:
         progress = Progress(self.config, frames=frames)
         recent = RecentEpisodes(self.config.recent_episodes)
         try:
-            with build_collector(self.config, self.learner.networks.actor, frames_done=frames) as collector:
+            with build_collector(self.config, self.policy, frames_done=frames) as collector:
                 self._iterate(collector, signals, progress, recent)
         except Interrupted:
             # Raised only between updates or while collecting, so what is saved is the end of a whole update.
@@ -141,10 +146,15 @@ class _Run:
             progress.close()
         return self._save()
 
+    def sync(self) -> None:
+        # In place: workers have this memory mapped, so no message has to reach them, and none can be waited for in vain.
+        if self.policy is not self.learner.networks.actor:
+            self.policy.load_state_dict(self.learner.networks.actor.state_dict())
+
     def _iterate(self, collector: BaseCollector, signals: _Signals, progress: Progress, recent: RecentEpisodes) -> None:
         while self.learner.frames < self.config.total_frames:
             started = time.monotonic()
-            with signals.raising():
+            with signals.raising(), _worker_errors():
                 batch = collector.next()
             collected = time.monotonic()
             _require_finite(batch, self.learner.frames)
@@ -156,7 +166,7 @@ class _Run:
                 **rollout_statistics(batch),
                 **self.learner.update(batch),
             }
-            collector.update_policy_weights_()
+            self.sync()
             finished = time.monotonic()
             row["collect_seconds"], row["update_seconds"] = collected - started, finished - collected
             row["frames_per_second"] = batch.numel() / (finished - started)
@@ -227,6 +237,18 @@ def _locked(folder: Path) -> Iterator[None]:
             msg = f"{folder} is being trained in by another process; accepted: another --run-dir"
             raise CheckpointError(msg) from None
         yield
+
+
+@contextmanager
+def _worker_errors() -> Iterator[None]:
+    # TorchRL tells of a process that died by a RuntimeError, after the worker's own traceback has been printed.
+    try:
+        yield
+    except RuntimeError as error:
+        if "process failed" not in str(error):
+            raise
+        msg = f"{error} The last checkpoint is intact; go on with --resume"
+        raise WorkerError(msg) from None
 
 
 def _require_finite(batch: TensorDictBase, frames: int) -> None:

@@ -10,6 +10,7 @@ from cura_torchrl import keys
 from cura_torchrl.envs.config import RobotConfig
 from cura_torchrl.envs.mdp import geometry
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
+from cura_torchrl.envs.robots import route
 
 
 class ScriptedPusher(TensorDictModuleBase):
@@ -78,3 +79,48 @@ class ScriptedPusher(TensorDictModuleBase):
         base = base / base.norm(dim=-1, keepdim=True).clamp_min(1.0)
         lift = torch.zeros_like(turn)
         return torch.cat([base, spin / self.robot.max_base_yaw_rate, arm / self.robot.max_tcp_speed, lift], dim=-1)
+
+
+class ScriptedAvoider(ScriptedPusher):
+    """Push along the shortest route around every obstacle that has appeared, seen or not: what is possible at all.
+
+    Needs an environment with ``TaskConfig.privileged``. Routes are kept until an obstacle appears or the goal changes.
+
+    Args:
+        robot: Limits that actions are shares of.
+        speed: Pushing speed [m/s].
+        margin: Least distance between the object's inscribed circle and an obstacle that a route keeps [m].
+        look_ahead: How far along the route the object is sent [m].
+    """
+
+    def __init__(
+        self, robot: RobotConfig | None = None, *, speed: float = 0.6, margin: float = 0.45, look_ahead: float = 1.2
+    ) -> None:
+        super().__init__(robot, speed=speed)
+        self.in_keys = [keys.OBSERVATION, keys.OBSTACLES, keys.SENSOR_POSE]
+        self.margin = margin
+        self.look_ahead = look_ahead
+        self._known: torch.Tensor | None = None
+        self._value = torch.empty(0)
+
+    def _waypoint(self, tensordict: TensorDictBase, parts: dict[str, torch.Tensor]) -> torch.Tensor:
+        base = tensordict[keys.SENSOR_POSE]
+        goal = geometry.from_frame(base, parts["goal_position"])
+        centre = geometry.from_frame(base, parts["object_position"][..., :2])
+        radius = parts["object_position"][..., 2] + self.margin
+        self._plan(tensordict[keys.OBSTACLES], goal, radius)
+        cells = round(self.look_ahead / route.CELL)
+        ahead = route.follow(self._value, centre, cells)
+        is_near = geometry.norm(goal - centre) < self.look_ahead
+        return geometry.to_frame(base, torch.where(is_near[..., None], goal, ahead))
+
+    def _plan(self, obstacles: torch.Tensor, goal: torch.Tensor, radius: torch.Tensor) -> None:
+        # The goal is read back from the base frame: round it, or its last bits would ask for a new plan in every step.
+        scene = torch.cat([obstacles.flatten(1), goal.mul(20).round().div(20), radius[:, None]], dim=-1)
+        if self._known is None or self._known.shape != scene.shape:
+            self._known, self._value = torch.full_like(scene, torch.nan), torch.empty(len(scene), *route.cell_centres().shape[:2])
+        changed = (~(self._known == scene).all(-1)).nonzero().flatten()
+        if len(changed):
+            cost = route.step_cost(obstacles[changed], radius[changed], soft_margin=0.6)
+            self._value[changed] = route.cost_to_go(cost, goal[changed])
+            self._known[changed] = scene[changed]

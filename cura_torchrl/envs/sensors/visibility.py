@@ -126,22 +126,6 @@ def unit_vector(angle: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.cos(wide).float(), torch.sin(wide).float()
 
 
-def ray_bearings(num_rays: int) -> torch.Tensor:
-    """Return the bearing of each ray in the base frame.
-
-    Args:
-        num_rays: Rays per turn [1].
-
-    Returns:
-        ``-pi + i * 2 pi / num_rays`` [rad], shape ``[R]``.
-
-    Examples:
-        >>> [round(bearing, 4) for bearing in ray_bearings(4).tolist()]
-        [-3.1416, -1.5708, 0.0, 1.5708]
-    """
-    return (torch.arange(num_rays, dtype=torch.float64) * (2 * math.pi / num_rays) - math.pi).float()
-
-
 def clean_scan(scan: torch.Tensor, max_range: float) -> torch.Tensor:
     """Bring ranges into [0, max_range].
 
@@ -175,7 +159,8 @@ def seen_free(
     Args:
         row_x: World x of the cell centres of each row [m], shape ``[X]``.
         column_y: World y of the cell centres of each column [m], shape ``[Y]``.
-        scan: Ranges as from :func:`clean_scan` [m], rays as in :func:`ray_bearings`, shape ``[N, R]``.
+        scan: Ranges as from :func:`clean_scan` [m], rays as in :func:`~cura_torchrl.envs.sensors.ray_angles`, shape
+            ``[N, R]``.
         sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
         half_diagonal: Half of a cell's diagonal [m].
         scratch: Work space of one float tensor to overwrite, shape ``[N, X, Y]``; None allocates it.
@@ -204,7 +189,7 @@ def seen_free(
     return position.sub_(dx.square()).sub_(dy.square()).sign_().relu_()
 
 
-def ray_ends(
+def scan_points(
     scan: torch.Tensor, sensor_pose: torch.Tensor, directions: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return where rays end.
@@ -218,7 +203,7 @@ def ray_ends(
         World x and y of the end points [m], both of shape ``[N, R]``.
 
     Examples:
-        >>> x, y = ray_ends(torch.tensor([[2.0]]), torch.tensor([[1.0, 1.0, 0.0]]), torch.tensor([[1.0], [0.0]]))
+        >>> x, y = scan_points(torch.tensor([[2.0]]), torch.tensor([[1.0, 1.0, 0.0]]), torch.tensor([[1.0], [0.0]]))
         >>> x.tolist(), y.tolist()
         ([[3.0]], [[1.0]])
     """

@@ -18,6 +18,7 @@ from torchrl.envs.transforms.utils import _get_reset
 from cura_torchrl import keys
 from cura_torchrl.envs.config import MapConfig, require
 from cura_torchrl.envs.sensors import visibility
+from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.envs.sensors.visibility import MapGrid
 
 if TYPE_CHECKING:
@@ -47,15 +48,15 @@ class ConfidenceMap(Transform):
     (ahead of the robot for large ``i``), column ``j`` at base-frame ``y = (j - (W - 1) / 2) * resolution`` (to its left
     for large ``j``); each takes the map cell that its centre lies in. Outside of the map's extent everything is unseen.
 
-    ====================== ======= ============================================================ ==================
-    Key (default)          Access  Content                                                      Shape
-    ====================== ======= ============================================================ ==================
-    ``scan``               read    Ranges [m]; see :func:`~cura_torchrl.envs.sensors.ray_bearings` ``[*, R]``
-    ``sensor_pose``        read    Sensor (x [m], y [m], yaw [rad]), world frame                ``[*, 3]``
-    ``object_pose``        read    Object's centre (x [m], y [m], yaw [rad]), world frame       ``[*, 3]``
-    ``object_size``        read    Object's footprint (length, width) [m]                       ``[*, 2]``
-    ``confidence_map``     write   Window of the map [1]; channels as in ``config.channels``    ``[*, C, W, W]``
-    ====================== ======= ============================================================ ==================
+    ================== ====== ==================================================================== ================
+    Key (default)      Access Content                                                              Shape
+    ================== ====== ==================================================================== ================
+    ``scan``           read   Ranges [m], rays as in :func:`~cura_torchrl.envs.sensors.ray_angles` ``[*, R]``
+    ``sensor_pose``    read   Sensor (x [m], y [m], yaw [rad]), world frame                        ``[*, 3]``
+    ``object_pose``    read   Object's centre (x [m], y [m], yaw [rad]), world frame               ``[*, 3]``
+    ``object_size``    read   Object's footprint (length, width) [m]                               ``[*, 2]``
+    ``confidence_map`` write  Window of the map [1]; channels as in ``config.channels``            ``[*, C, W, W]``
+    ================== ====== ==================================================================== ================
 
     A reset forgets the rows that are reset and integrates their first scan; in the other rows the window that
     ``_reset`` returns is 0, for TorchRL keeps their old value. Rows never depend on one another. A range that is not a
@@ -110,13 +111,12 @@ class ConfidenceMap(Transform):
         self.max_range = max_range
         self.grid = MapGrid(extent_x=config.extent_x, extent_y=config.extent_y, resolution=config.resolution)
         offsets = visibility.window_offsets(config.window, config.resolution)
-        bearings = visibility.ray_bearings(num_rays)
         origin = torch.zeros(1, 3)
         tables = {
             "_row_x": self.grid.row_x(),
             "_column_y": self.grid.column_y(),
             "_offsets": offsets,
-            "_directions": torch.stack(visibility.unit_vector(bearings)),
+            "_directions": torch.stack(visibility.unit_vector(ray_angles(num_rays))),
             "_powers": _decay_powers(config.decay),
             "_robot_size": torch.tensor(robot_size),
             "_outside_robot": visibility.outside_footprint(offsets, origin, origin, torch.tensor(robot_size)),
@@ -229,7 +229,7 @@ class ConfidenceMap(Transform):
     def _mark_hits(
         self, stamps: torch.Tensor, steps: torch.Tensor, scan: torch.Tensor, inputs: list[torch.Tensor]
     ) -> None:
-        x, y = visibility.ray_ends(scan, inputs[1], self._directions)
+        x, y = visibility.scan_points(scan, inputs[1], self._directions)
         cells, is_inside = visibility.cell_of_points(self.grid, x, y)
         # Half a cell below the maximum is five times the LiDAR's noise: a noisy miss is no obstacle.
         is_hit = is_inside & (scan > 0.0) & (scan < self.max_range - 0.5 * self.config.resolution)
@@ -258,7 +258,7 @@ class ConfidenceMap(Transform):
         torch.mul(spare, last_seen.clamp_(max=1.0), out=window[:, 0])
         if self.config.channels == "confidence":
             return
-        occupancy = stamp.clamp_(-1.0, 0.0).neg_().mul_(self._outside_robot)
+        occupancy = stamp.clamp_(-1.0, 0.0).abs_().mul_(self._outside_robot)
         if len(inputs) > 2:
             occupancy.mul_(visibility.outside_footprint(self._offsets, *inputs[1:], scratch[1:3]))
         if self.config.channels == "product":
