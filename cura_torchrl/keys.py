@@ -10,10 +10,13 @@ ACTION = "action"
 """Policy action in [-1, 1], shape ``[*, A]``: base (vx, vy, wz), then end-effector (vx, vy, vz), base frame."""
 
 OBSERVATION = "observation"
-"""Proprioception, object and goal in the base frame, shape ``[*, D]``; see :mod:`cura_torchrl.envs.mdp.observations`."""
+"""Robot, object and goal in the base frame, shape ``[*, D]``; see :mod:`cura_torchrl.envs.mdp.observations`."""
 
 SCAN = "scan"
-"""LiDAR ranges [m], shape ``[*, R]``; a miss is the maximum range. Ray ``i`` points at ``-pi + i * 2 pi / R`` in the base frame."""
+"""LiDAR ranges [m], shape ``[*, R]``; a miss is the maximum range.
+
+Ray ``i`` points at ``-pi + i * 2 pi / R`` in the base frame.
+"""
 
 SENSOR_POSE = "sensor_pose"
 """LiDAR (x [m], y [m], yaw [rad]) in the world frame, shape ``[*, 3]``."""
@@ -43,7 +46,7 @@ CONTACT = "contact"
 """What touches an obstacle: (base, arm, object), bool, shape ``[*, 3]``."""
 
 SUCCESS = "success"
-"""Goal reached, latched, for each tolerance of ``TaskConfig.tolerances`` (0.5 m; 0.25 m; 0.10 m and 10 degrees), bool, shape ``[*, 3]``."""
+"""Goal reached before any collision, latched, for each of ``TaskConfig.tolerances``, bool, shape ``[*, 3]``."""
 
 TIPPED = "tipped"
 """The object has tilted by more than the limit in this episode, bool, shape ``[*, 1]``."""
@@ -55,7 +58,10 @@ ELAPSED_STEPS = "elapsed_steps"
 """Policy steps since the start of the episode, int64, shape ``[*, 1]``."""
 
 OBSTACLES = "obstacles"
-"""True obstacles (x [m], y [m], yaw [rad], edge [m]) in the world frame, edge 0 where none has appeared, shape ``[*, 6, 4]``; privileged."""
+"""True obstacles (x [m], y [m], yaw [rad], edge [m]), world frame, shape ``[*, 6, 4]``; edge 0 where none has appeared.
+
+Privileged: emitted with ``TaskConfig.privileged`` only.
+"""
 
 STATE_VALUE = "state_value"
 """Critic's estimate of the return, shape ``[*, 1]``."""

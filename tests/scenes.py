@@ -17,8 +17,10 @@ MAX_RANGE = 10.0
 NUM_RAYS = 360
 
 
-def cast_rays(rectangles: np.ndarray, pose: np.ndarray, num_rays: int = NUM_RAYS, max_range: float = MAX_RANGE) -> np.ndarray:
-    """Return the distance from a sensor (x, y, yaw) to the first of rectangles (x, y, yaw, length, width) along each ray."""
+def cast_rays(
+    rectangles: np.ndarray, pose: np.ndarray, num_rays: int = NUM_RAYS, max_range: float = MAX_RANGE
+) -> np.ndarray:
+    """Return how far a sensor (x, y, yaw) sees along each ray past rectangles (x, y, yaw, length, width)."""
     angle = -math.pi + np.arange(num_rays) * 2 * math.pi / num_rays + pose[2]
     nearest = np.full(num_rays, max_range)
     for x, y, yaw, length, width in rectangles:
@@ -48,7 +50,8 @@ class ReferenceMap:
         """Integrate a scan and return the window; ``box`` is the known object (x, y, yaw, length, width)."""
         rays = len(scan)
         centre_x, centre_y = np.meshgrid(
-            *[low + (np.arange(n) + 0.5) * self.resolution for low, n in zip(self.low, self.count, strict=True)], indexing="ij"
+            *[low + (np.arange(n) + 0.5) * self.resolution for low, n in zip(self.low, self.count, strict=True)],
+            indexing="ij",
         )
         dx, dy = centre_x - pose[0], centre_y - pose[1]
         nearest_ray = np.round((np.arctan2(dy, dx) - pose[2] + math.pi) * rays / (2 * math.pi)).astype(int) % rays
@@ -58,7 +61,11 @@ class ReferenceMap:
         known = [(pose[0], pose[1], pose[2], *self.robot_size)]
         if box is not None:
             known.append((*box[:3], box[3] + 2 * self.resolution, box[4] + 2 * self.resolution))
-        hits = []
+        self._mark(scan, pose, known, max_range)
+        return self.read(pose, box)
+
+    def _mark(self, scan, pose, known, max_range: float) -> None:
+        rays, hits = len(scan), []
         for i, distance in enumerate(scan):
             if not 0 < distance < max_range - self.resolution / 2:
                 continue
@@ -74,7 +81,6 @@ class ReferenceMap:
         for cell, is_known in hits:
             if not is_known:
                 self.occupancy[cell] = 1.0
-        return self.read(pose, box)
 
     def read(self, pose, box=None) -> np.ndarray:
         """Return the window (confidence, occupancy), row along base x, column along base y."""
@@ -108,7 +114,9 @@ class ScanEnv(EnvBase):
 
     batch_locked = True
 
-    def __init__(self, labels: tuple[int, ...] = (0, 1), *, has_object: bool = True, dtype: torch.dtype = torch.float32) -> None:
+    def __init__(
+        self, labels: tuple[int, ...] = (0, 1), *, has_object: bool = True, dtype: torch.dtype = torch.float32
+    ) -> None:
         rows = len(labels)
         super().__init__(batch_size=torch.Size([rows]))
         self.labels, self.has_object, self.dtype_ = labels, has_object, dtype
@@ -118,7 +126,10 @@ class ScanEnv(EnvBase):
             "sensor_pose": Unbounded(shape=(rows, 3), dtype=dtype),
         }
         if has_object:
-            leaves |= {"object_pose": Unbounded(shape=(rows, 3), dtype=dtype), "object_size": Unbounded(shape=(rows, 2), dtype=dtype)}
+            leaves |= {
+                "object_pose": Unbounded(shape=(rows, 3), dtype=dtype),
+                "object_size": Unbounded(shape=(rows, 2), dtype=dtype),
+            }
         self.observation_spec = Composite(leaves, shape=(rows,))
         self.action_spec = Bounded(-1.0, 1.0, shape=(rows, 1))
         self.reward_spec = Unbounded(shape=(rows, 1))
@@ -131,7 +142,7 @@ class ScanEnv(EnvBase):
         pose = np.array([0.13 * time + 0.3 * label, 0.21 * episode - 0.17 * label, 0.4 * label + 0.11 * time + 0.05])
         ahead = np.array([math.cos(pose[2]), math.sin(pose[2])]) * 1.6
         box = (pose[0] + ahead[0], pose[1] + ahead[1], 0.3 + 0.1 * time, 0.75, 0.5)
-        walls = [(4.0 + label, 1.0, 0.5, 1.0, 0.6), (-2.0, -3.0 + 0.5 * episode, 0.0, 0.4, 0.4)]
+        walls = [(4.0 + label, 1.0, 0.5, 1.0, 0.6), (-2.03, -3.04 + 0.5 * episode, 0.0, 0.4, 0.4)]
         return cast_rays(np.array([*walls, *([box] if self.has_object else [])]), pose), pose, box
 
     def _emit(self) -> TensorDict:
@@ -139,7 +150,9 @@ class ScanEnv(EnvBase):
         out = {"scan": scan, "sensor_pose": pose}
         if self.has_object:
             out |= {"object_pose": box[:, :3], "object_size": box[:, 3:]}
-        return TensorDict({key: torch.tensor(value, dtype=self.dtype_) for key, value in out.items()}, batch_size=self.batch_size)
+        return TensorDict(
+            {key: torch.tensor(value, dtype=self.dtype_) for key, value in out.items()}, batch_size=self.batch_size
+        )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)

@@ -1,6 +1,7 @@
 """Frozen configuration of the task, the robot, the LiDAR, the map and the physics: pure data, no torch, no simulator.
 
-The only place where a default is written down. A field's docstring gives its unit; ``cura-torchrl train --help`` prints it.
+The only place where a default is written down. A field's docstring gives its unit, and ``cura-torchrl train --help``
+prints it.
 """
 
 from __future__ import annotations
@@ -40,10 +41,7 @@ def require_finite(config: object) -> None:
     """Raise unless every number in a dataclass, nested tuples included, is finite.
 
     Args:
-        config: A dataclass instance.
-
-    Raises:
-        ValueError: If a float field is NaN or infinite.
+        config: A dataclass instance; a number in it that is NaN or infinite is refused with a ValueError.
 
     Examples:
         >>> require_finite(LidarConfig())
@@ -107,7 +105,7 @@ class ScenarioConfig:
     floor_friction: tuple[float, float] = (0.25, 0.6)
     """Coulomb friction between object and floor [1]."""
     com_shift: float = 0.1
-    """Offset of the object's centre of mass along each axis, as a share of the edge, uniform in plus or minus this [1]."""
+    """Offset of the object's centre of mass along each axis, a share of the edge, uniform in plus or minus this [1]."""
 
     def __post_init__(self) -> None:
         require_finite(self)
@@ -190,13 +188,14 @@ class TaskConfig:
     privileged: bool = False
     """Whether observations include the true obstacles, for scripted policies and diagnosis."""
     curriculum: tuple[tuple[int, int], ...] = ()
-    """Steps (frames, K): from this many frames on, at most K obstacles; empty means ``scenario.max_obstacles`` throughout."""
+    """Steps (frames, K): from this many frames on, at most K obstacles; if empty, always ``scenario.max_obstacles``."""
 
     def __post_init__(self) -> None:
         require_finite(self)
         require(self.policy_period > 0, "policy_period", self.policy_period, "a positive time [s]")
         require(self.success_time >= 0, "success_time", self.success_time, "a time that is not negative [s]")
-        require(self.episode_time >= self.policy_period, "episode_time", self.episode_time, "at least one policy period [s]")
+        least = self.policy_period
+        require(self.episode_time >= least, "episode_time", self.episode_time, "at least one policy period [s]")
         frames = [step[0] for step in self.curriculum]
         require(frames == sorted(frames), "curriculum", self.curriculum, "steps in increasing frames")
         require(all(0 <= step[1] <= 6 for step in self.curriculum), "curriculum", self.curriculum, "0 to 6 obstacles")
@@ -219,7 +218,7 @@ class RobotConfig:
     ik_damping: float = 0.02
     """Damping factor lambda of the damped least squares; the paper's value [1]."""
     ik_rate: float = 25.0
-    """Rate at which the differential IK is solved [Hz]; joint references are integrated at the control rate in between."""
+    """Rate at which the differential IK is solved [Hz]; in between, references are integrated at the control rate."""
     posture_gain: float = 1.0
     """Gain of the null-space posture task [1/s]."""
     position_gain: float = 5.0
@@ -251,7 +250,8 @@ class RobotConfig:
         require_finite(self)
         for name in ("max_base_speed", "max_base_yaw_rate", "max_tcp_speed", "ik_damping", "ik_rate"):
             require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
-        require(len(self.stiffness) == 7 and len(self.damping) == 7, "stiffness, damping", (self.stiffness, self.damping), "7 each")
+        gains = (self.stiffness, self.damping)
+        require(all(len(gain) == 7 for gain in gains), "stiffness, damping", gains, "7 each")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -272,7 +272,8 @@ class LidarConfig:
     def __post_init__(self) -> None:
         require_finite(self)
         require(8 <= self.num_rays <= 8192, "num_rays", self.num_rays, "8 to 8192")
-        require(self.max_range > 0 and self.noise >= 0, "max_range, noise", (self.max_range, self.noise), "positive, not negative [m]")
+        lengths = (self.max_range, self.noise)
+        require(self.max_range > 0 and self.noise >= 0, "max_range, noise", lengths, "positive, not negative [m]")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -295,7 +296,8 @@ class MapConfig:
     def __post_init__(self) -> None:
         require_finite(self)
         require(0.0 <= self.decay <= 1.0, "decay", self.decay, "0 to 1")
-        require(self.resolution > 0 and self.window > 0, "resolution, window", (self.resolution, self.window), "positive numbers")
+        size = (self.resolution, self.window)
+        require(min(size) > 0, "resolution, window", size, "positive numbers")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,5 +334,6 @@ class PushEnvConfig:
     """Which simulator runs the worlds."""
 
     def __post_init__(self) -> None:
-        ticks = self.task.policy_period / self.physics.control_period
-        require(abs(ticks - round(ticks)) < 1e-6, "control_period", self.physics.control_period, "a divisor of policy_period")
+        period = self.physics.control_period
+        ticks = self.task.policy_period / period
+        require(abs(ticks - round(ticks)) < 1e-6, "control_period", period, "a divisor of policy_period")

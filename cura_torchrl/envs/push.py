@@ -1,4 +1,4 @@
-"""The pushing task as one natively batched TorchRL environment: N worlds in this process, partial resets, auto-reset by TorchRL."""
+"""The pushing task as one natively batched TorchRL environment: N worlds in this process, reset row by row."""
 
 from __future__ import annotations
 
@@ -137,7 +137,11 @@ class PushEnv(EnvBase):
 
     @property
     def world_state(self) -> WorldState:
-        """State of the worlds after the last step; reset first."""
+        """State of the worlds after the last step.
+
+        Raises:
+            RuntimeError: If the environment has not been reset.
+        """
         if self._state is None:
             msg = "the environment has not been reset; accepted: reset() before world_state"
             raise RuntimeError(msg)
@@ -145,7 +149,7 @@ class PushEnv(EnvBase):
 
     @property
     def obstacles(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Obstacles that have appeared: mask ``[N, 6]``, (x [m], y [m], yaw [rad]) ``[N, 6, 3]``, edge [m] ``[N, 6]``."""
+        """Which obstacles have appeared ``[N, 6]``, (x [m], y [m], yaw [rad]) ``[N, 6, 3]``, edge [m] ``[N, 6]``."""
         return self._obstacle_active.clone(), self._obstacle_pose.clone(), self.scenario["obstacle_edge"].clone()
 
     @property
@@ -167,12 +171,17 @@ class PushEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self._scenario_seed = 0 if seed is None else int(seed)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, *, episodes: torch.Tensor | None = None, **_: Any) -> TensorDict:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, episodes: torch.Tensor | None = None, **_: Any
+    ) -> TensorDict:
         """Reset the rows of the mask, or all.
 
         Args:
             tensordict: May hold the mask ``_reset``.
             episodes: Scenarios to play, int64, shape ``[N]``; each row's next one when left out.
+
+        Returns:
+            What every row observes now.
         """
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = torch.arange(self.num_envs) if mask is None else mask.reshape(self.num_envs).nonzero().flatten()
@@ -255,8 +264,8 @@ class PushEnv(EnvBase):
         state = self.world_state
         edge = torch.where(self._obstacle_active, self.scenario["obstacle_edge"], 0.0)
         bodies = torch.cat([self._obstacle_pose, _planar(state)[:, None]], dim=1)
-        seen = self.scenario["object_edge"] if self.config.lidar.occlusion else torch.zeros(self.num_envs, dtype=torch.float64)
-        edges = torch.cat([edge, seen[:, None]], dim=1)
+        object_edge = self.scenario["object_edge"][:, None]
+        edges = torch.cat([edge, object_edge if self.config.lidar.occlusion else torch.zeros_like(object_edge)], dim=1)
         # A fresh tensor: what was emitted before must not change.
         scan = self._scan.clone()
         scan[rows] = self._lidar.scan(rows.tolist(), state.base_pose[rows], bodies[rows], edges[rows])
@@ -264,8 +273,10 @@ class PushEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict[keys.ACTION].detach().cpu().clamp(-1.0, 1.0)
-        if not bool(torch.isfinite(action).all()):
-            msg = f"action has values that are not finite in rows {(~action.isfinite().all(-1)).nonzero().flatten().tolist()}"
+        finite = action.isfinite().all(-1)
+        if not bool(finite.all()):
+            rows = (~finite).nonzero().flatten().tolist()
+            msg = f"action is not a number in rows {rows}; accepted: numbers, of which those beyond -1 or 1 are clamped"
             raise ValueError(msg)
         before = self.world_state
         to_object = geometry.to_frame(before.base_pose, before.object_position[:, :2])
@@ -278,28 +289,40 @@ class PushEnv(EnvBase):
         self._measure(torch.arange(self.num_envs))
         cost, reward = self._judge(action, before)
         terminated, truncated = endings(
-            self.config.task, contact=self.world_state.contact, elapsed_steps=self._elapsed + self._age, steps_since_success=self._since_success
-        )  # fmt: skip
+            self.config.task,
+            contact=self.world_state.contact,
+            elapsed_steps=self._elapsed + self._age,
+            steps_since_success=self._since_success,
+        )
         self._previous_action = action.float()
-        ends = {"terminated": terminated[:, None], "truncated": truncated[:, None], "done": (terminated | truncated)[:, None]}
-        return self._emit().update({keys.REWARD: reward, keys.COST: cost, **ends})
+        ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+        columns = {name: flag[:, None] for name, flag in ends.items()}
+        return self._emit().update({keys.REWARD: reward, keys.COST: cost, **columns})
 
     def _judge(self, action: torch.Tensor, before: WorldState) -> tuple[torch.Tensor, torch.Tensor]:
-        """Update success and tipping; return cost and reward, shape ``[N, 1]`` each."""
+        """Update success and tipping.
+
+        Returns:
+            Cost and reward, shape ``[N, 1]`` each.
+        """
         state, scene, task = self.world_state, self.scenario, self.config.task
+        position, quaternion, edge = state.object_position, state.object_quaternion, scene["object_edge"]
         flags = success_flags(task, _planar(state), scene["goal_pose"])
-        self._success, self._since_success = latch_success(self._success, self._since_success, flags=flags, contact=state.contact)
-        self._tipped = self._tipped | (geometry.tilt_from_quaternion(state.object_quaternion) > task.tilt_limit)
-        goal = torch.cat([scene["goal_pose"][:, :2], scene["object_edge"][:, None] / 2], dim=-1)
+        self._success, self._since_success = latch_success(
+            self._success, self._since_success, flags=flags, contact=state.contact
+        )
+        self._tipped = self._tipped | (geometry.tilt_from_quaternion(quaternion) > task.tilt_limit)
+        goal = torch.cat([scene["goal_pose"][:, :2], edge[:, None] / 2], dim=-1)
+        goal_quaternion = geometry.quaternion_from_yaw(scene["goal_pose"][:, 2])
         tcp_w = torch.cat([geometry.from_frame(state.base_pose, self._tcp[:, :2]), self._tcp[:, 2:]], dim=-1)
         terms = reward_terms(
             task.reward,
-            object_corners=geometry.cube_corners(state.object_position, state.object_quaternion, scene["object_edge"]),
-            goal_corners=geometry.cube_corners(goal, geometry.quaternion_from_yaw(scene["goal_pose"][:, 2]), scene["object_edge"]),
+            object_corners=geometry.cube_corners(position, quaternion, edge),
+            goal_corners=geometry.cube_corners(goal, goal_quaternion, edge),
             object_velocity=state.object_velocity[:, :2],
-            object_position=state.object_position[:, :2],
+            object_position=position[:, :2],
             goal_position=goal[:, :2],
-            surface_point_w=geometry.transform_point(state.object_position, state.object_quaternion, scene["surface_point"]),
+            surface_point_w=geometry.transform_point(position, quaternion, scene["surface_point"]),
             tcp_position=tcp_w,
             action=action.double(),
             previous_action=self._previous_action.double(),
@@ -344,13 +367,13 @@ class PushEnv(EnvBase):
         return emitted if self.device is None else emitted.to(self.device)
 
     def _tcp_velocity(self) -> torch.Tensor:
-        """Velocity of the TCP relative to the world, in the base frame [m/s], shape ``[N, 3]``."""
+        """Return the velocity of the TCP relative to the world, in the base frame [m/s], shape ``[N, 3]``."""
         state, tcp = self.world_state, self._tcp
         base = geometry.rotate(state.base_velocity[:, :2], -state.base_pose[:, 2])
         spin = state.base_velocity[:, 2]
         arm = (self._jacobian[:, :3] @ state.joint_velocity[:, :, None])[:, :, 0]
-        moved = torch.stack([base[:, 0] - spin * tcp[:, 1], base[:, 1] + spin * tcp[:, 0], torch.zeros_like(spin)], dim=-1)
-        return arm + moved
+        carried = [base[:, 0] - spin * tcp[:, 1], base[:, 1] + spin * tcp[:, 0], torch.zeros_like(spin)]
+        return arm + torch.stack(carried, dim=-1)
 
     def close(self, *, raise_if_closed: bool = False) -> None:
         """Disconnect the simulator; harmless when done twice."""
@@ -360,5 +383,6 @@ class PushEnv(EnvBase):
 
 
 def _planar(state: WorldState) -> torch.Tensor:
-    """Object's (x [m], y [m], yaw [rad]), shape ``[N, 3]``."""
-    return torch.cat([state.object_position[:, :2], geometry.yaw_from_quaternion(state.object_quaternion)[:, None]], dim=-1)
+    """Return the object's (x [m], y [m], yaw [rad]), shape ``[N, 3]``."""
+    yaw = geometry.yaw_from_quaternion(state.object_quaternion)
+    return torch.cat([state.object_position[:, :2], yaw[:, None]], dim=-1)

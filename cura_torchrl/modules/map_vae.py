@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -35,13 +34,15 @@ def map_vae_loss(
     maps: torch.Tensor,
     *,
     beta: float,
+    occupancy_weight: float,
     occupied_weight: float,
 ) -> MapLoss:
     """Return the loss of a variational autoencoder of maps.
 
-    The reconstruction is a binary cross-entropy in all cells and channels. An obstacle fills few of the cells, so that
-    occupied ones count more; the last channel tells which they are (the occupancy, or the product). A map of confidence
-    alone has no occupied cells: there the weight has no effect if it is 1 and is not to be used otherwise.
+    The reconstruction is a binary cross-entropy in all cells and channels. An obstacle fills few of the cells: the last
+    channel, which tells where it is (the occupancy, or the product), counts more than the confidence, so that the code
+    is spent on it, and occupied cells count more than the others, so that they are found. A map of confidence alone
+    wants both weights to be 1.
 
     Args:
         logits: Decoder's output, log-odds [1], shape ``[B, C, H, W]``.
@@ -49,7 +50,8 @@ def map_vae_loss(
         log_variance: Logarithm of the code's variance [1], shape ``[B, L]``.
         maps: Target in [0, 1], shape ``[B, C, H, W]``.
         beta: Weight of the divergence [1].
-        occupied_weight: Weight of a cell of the last channel whose target is 1; others have weight 1 [1].
+        occupancy_weight: Weight of the last channel; others have weight 1 [1].
+        occupied_weight: Weight of a cell of the last channel whose target is 1, beside those whose target is 0 [1].
 
     Returns:
         The terms.
@@ -60,13 +62,19 @@ def map_vae_loss(
     Examples:
         >>> nothing = torch.zeros(1, 2)
         >>> loss = map_vae_loss(
-        ...     torch.zeros(1, 1, 1, 2), nothing, nothing, torch.tensor([[[[0.0, 1.0]]]]), beta=1.0, occupied_weight=3.0
+        ...     torch.zeros(1, 1, 1, 2),
+        ...     nothing,
+        ...     nothing,
+        ...     torch.tensor([[[[0.0, 1.0]]]]),
+        ...     beta=1.0,
+        ...     occupancy_weight=2.0,
+        ...     occupied_weight=3.0,
         ... )
         >>> round(loss.reconstruction.item() / torch.tensor(2.0).log().item(), 4), loss.divergence.item()
-        (4.0, 0.0)
+        (8.0, 0.0)
     """
     weight = torch.ones_like(maps)
-    weight[:, -1].add_(maps[:, -1], alpha=occupied_weight - 1.0)
+    weight[:, -1].add_(maps[:, -1], alpha=occupied_weight - 1.0).mul_(occupancy_weight)
     entropy = F.binary_cross_entropy_with_logits(logits, maps, weight=weight, reduction="sum") / len(maps)
     divergence = 0.5 * (mean.square() + log_variance.exp() - 1.0 - log_variance).sum() / len(maps)
     return MapLoss(entropy + beta * divergence, entropy, divergence)
@@ -76,7 +84,8 @@ class MapVAE(nn.Module):
     """Encodes maps into short codes and decodes codes into maps.
 
     The encoder is a 5 x 5 convolution with stride 4 and two 3 x 3 convolutions with stride 2, each followed by an ELU,
-    then a linear layer to mean and log-variance; the decoder mirrors it. As a module it returns the mean, so that an
+    then a linear layer to mean and log-variance. The decoder mirrors it, but in the end each pixel paints a tile of
+    4 x 4 cells of its own, which is faster than a transposed convolution. As a module it returns the mean, so that an
     instance is an encoder for :class:`~cura_torchrl.envs.transforms.EncodeMap`, or for
     ``TensorDictModule(vae, [keys.CONFIDENCE_MAP], [keys.LATENT])``.
 
@@ -124,18 +133,18 @@ class MapVAE(nn.Module):
         self.trunk = nn.Sequential(*layers, nn.Flatten())
         self.statistics_head = nn.Linear(features, 2 * latent_size)
         layers = [nn.Linear(latent_size, features), nn.ELU(), nn.Unflatten(1, (planes[-1], sizes[-1], sizes[-1]))]
-        for i in reversed(range(len(_STRIDES))):
+        for i in reversed(range(1, len(_STRIDES))):
             # What a convolution with this stride has rounded away, the transposed one has to add.
-            rest = sizes[i] - ((sizes[i + 1] - 1) * _STRIDES[i] + kernels[i] - 2 * (kernels[i] // 2))
+            rest = sizes[i] - ((sizes[i + 1] - 1) * _STRIDES[i] + 1)
             layers += [
                 nn.ConvTranspose2d(
                     planes[i + 1], planes[i], kernels[i], _STRIDES[i], padding=kernels[i] // 2, output_padding=rest
                 ),
                 nn.ELU(),
             ]
-        self.decoder = nn.Sequential(*layers[:-1])
+        self.decoder = nn.Sequential(*layers, _Tiles(planes[1], channels, _STRIDES[0], window))
         # Channels last suits the CPU's convolutions; most of all with few channels.
-        self.to(memory_format=torch.channels_last)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     @property
     def latent_size(self) -> int:
@@ -207,7 +216,7 @@ class MapVAE(nn.Module):
         """
         partial = path.with_name(f"{path.name}.partial")
         torch.save({"shape": self.shape, "state_dict": self.state_dict()}, partial)
-        os.replace(partial, path)
+        partial.replace(path)
 
     @classmethod
     def load(cls, path: Path) -> MapVAE:
@@ -226,3 +235,17 @@ class MapVAE(nn.Module):
 
     def _features(self, maps: torch.Tensor) -> torch.Tensor:
         return self.trunk(maps.contiguous(memory_format=torch.channels_last))
+
+
+class _Tiles(nn.Module):
+    """Paints each pixel as a tile of cells, then cuts the map to size."""
+
+    def __init__(self, in_channels: int, out_channels: int, edge: int, window: int) -> None:
+        super().__init__()
+        self.paint = nn.Linear(in_channels, out_channels * edge**2)
+        self.out_channels, self.edge, self.window = out_channels, edge, window
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        tiles = self.paint(pixels.permute(0, 2, 3, 1)).unflatten(-1, (self.out_channels, self.edge, self.edge))
+        maps = tiles.permute(0, 3, 1, 4, 2, 5).flatten(2, 3).flatten(3, 4)
+        return maps[..., : self.window, : self.window]

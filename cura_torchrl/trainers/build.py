@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import pickle
 import signal
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,11 +14,12 @@ import torch
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, TransformedEnv
+from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE
 from cura_torchrl.envs.push import ACTION_SIZE, PushEnv
 from cura_torchrl.envs.transforms import ConfidenceMap, EncodeMap
-from cura_torchrl.modules import DistributionalCollisionEstimator, ObservationNorm, make_actor, make_critic
+from cura_torchrl.modules import DistributionalCollisionEstimator, MapVAE, ObservationNorm, make_actor, make_critic
 from cura_torchrl.objectives import CURAAdvantage, CURALoss
 from cura_torchrl.trainers.errors import UnavailableError
 from cura_torchrl.trainers.privileged import ObstacleCode
@@ -70,7 +72,7 @@ class Networks(nn.Module):
 
 
 def _ignore_latent_(network: nn.Module) -> None:
-    """Let a network start without regard to the map's code: what was learned without a map goes on unharmed with one."""
+    """Let a network start without regard to the map's code: what was learned without a map stays with one."""
     first = next(layer for layer in network.modules() if isinstance(layer, nn.Linear))
     with torch.no_grad():
         first.weight[:, OBSERVATION_SIZE:] = 0.0
@@ -137,15 +139,18 @@ def load_encoder(path: Path | None) -> MapVAE:
         The encoder.
 
     Raises:
-        UnavailableError: If there are no weights.
+        UnavailableError: If there are no weights, or they are damaged.
     """
     weights = SHIPPED_ENCODER if path is None else path
+    accepted = "accepted: a file that `cura-torchrl pretrain-map` has written"
     if not weights.exists():
-        msg = f"encoder weights are missing at {weights}; accepted: a file that `cura-torchrl pretrain-map` has written"
+        msg = f"encoder weights are missing at {weights}; {accepted}"
         raise UnavailableError(msg)
-    from cura_torchrl.modules import MapVAE
-
-    return MapVAE.load(weights)
+    try:
+        return MapVAE.load(weights)
+    except (RuntimeError, ValueError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
+        msg = f"encoder weights at {weights} are damaged ({type(error).__name__}); {accepted}"
+        raise UnavailableError(msg) from None
 
 
 def make_env(config: TrainConfig, num_envs: int, *, keep_map: bool = False, **options: Any) -> TransformedEnv:
@@ -227,19 +232,21 @@ def build_collector(
         "auto_register_policy_transforms": False,
         "use_buffers": True,
     }
-    if config.num_workers == 1:
-        collector = Collector(factories[0], policy, **options)
-    else:
-        policy.share_memory()
-        collector = Collector(
-            factories, policy, sync=True, backend="process", backend_options={"cat_results": 0}, **options
-        )
-    # TorchRL takes a thread from the learner for every worker; they never run at the same time here.
-    torch.set_num_threads(config.learner_threads)
-    try:
+    if config.perception == "map":
+        load_encoder(config.encoder)  # what is wrong with it is told here, and not by each worker
+    with ExitStack() as stack:
+        if config.num_workers == 1:
+            collector = Collector(factories[0], policy, **options)
+        else:
+            scheme = SharedMemWeightSyncScheme()
+            # Left to the end of the process it would start a thread there, and the process would never end.
+            stack.callback(scheme.shutdown)
+            processes = {"sync": True, "backend": "process", "backend_options": {"cat_results": 0}}
+            collector = Collector(factories, policy, weight_sync_schemes={"policy": scheme}, **processes, **options)
+        stack.callback(collector.shutdown)
+        # TorchRL takes a thread from the learner for every worker; they never run at the same time here.
+        torch.set_num_threads(config.learner_threads)
         yield collector
-    finally:
-        collector.shutdown()
 
 
 SHIPPED_ENCODER = Path(__file__).parents[1] / "modules" / "weights" / "map_vae.pt"

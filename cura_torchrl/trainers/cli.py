@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
+from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.info import capabilities, git_commit, hardware, shipped_methods, versions
 from cura_torchrl.trainers.methods import METHODS, method
@@ -102,22 +103,23 @@ def _overview() -> str:
 def _train(arguments: list[str]) -> None:
     """Train a method."""
     options = _parse(TrainOptions, "train", arguments, TrainOptions(config=_defaults(arguments)))
+    _require_path(options.init_from)
+    module = _import("cura_torchrl.trainers.train")
     with _clean_stdout():
-        from cura_torchrl.trainers.train import train  # noqa: PLC0415 - see the module's docstring
-
-        _quieten_torchrl()
-        checkpoint = train(options.config, resume=options.resume, init_from=options.init_from)
+        checkpoint = module.train(options.config, resume=options.resume, init_from=options.init_from)
     sys.stdout.write(f"{checkpoint}\n")
 
 
 def _evaluate(arguments: list[str]) -> None:
     """Count how a policy's episodes end."""
     options = _parse(EvaluateOptions, "evaluate", arguments)
+    with _one_line_errors():
+        if options.config.method is not None:
+            method(options.config.method)
+    _require_path(options.config.checkpoint)
+    module = _import("cura_torchrl.trainers.evaluate")
     with _clean_stdout():
-        from cura_torchrl.trainers.evaluate import evaluate  # noqa: PLC0415 - see the module's docstring
-
-        _quieten_torchrl()
-        result = evaluate(options.config)
+        result = module.evaluate(options.config)
     sys.stdout.write(json.dumps(result, indent=2) + "\n" if options.json else _as_text(result))
 
 
@@ -136,24 +138,28 @@ def _info(arguments: list[str]) -> None:
 
 def _pretrain_map(arguments: list[str]) -> None:
     """Train the encoder of confidence maps."""
-    module = importlib.import_module("cura_torchrl.trainers.pretrain_map")
-    _quieten_torchrl()
-    module.pretrain_map(_parse(module.PretrainMapConfig, "pretrain-map", arguments))
+    module = _import("cura_torchrl.trainers.pretrain_map")
+    config = _parse(module.PretrainMapConfig, "pretrain-map", arguments)
+    with _clean_stdout():
+        module.pretrain_map(config)
 
 
 def _imitate(arguments: list[str]) -> None:
     """Warm-start the networks of every method by imitating the scripted pusher."""
-    module = importlib.import_module("cura_torchrl.trainers.imitate")
-    _quieten_torchrl()
-    checkpoint = module.imitate(_parse(module.ImitateConfig, "imitate", arguments))
+    module = _import("cura_torchrl.trainers.imitate")
+    config = _parse(module.ImitateConfig, "imitate", arguments)
+    with _clean_stdout():
+        checkpoint = module.imitate(config)
     sys.stdout.write(f"{checkpoint}\n")
 
 
 def _demo(arguments: list[str]) -> None:
     """Play the shipped policies on the same scenes, and write a page to look at."""
-    module = importlib.import_module("cura_torchrl.trainers.demo")
-    _quieten_torchrl()
-    module.demo(_parse(module.DemoConfig, "demo", arguments))
+    config = _parse(DemoConfig, "demo", arguments)
+    module = _import("cura_torchrl.trainers.demo")
+    with _clean_stdout():
+        page = module.demo(config)
+    sys.stdout.write(f"{page}\n")
 
 
 def _defaults(arguments: list[str]) -> TrainConfig:
@@ -167,11 +173,17 @@ def _defaults(arguments: list[str]) -> TrainConfig:
         preset = method(known.method or TrainConfig().method)
     if not known.resume:
         return preset
-    with _clean_stdout():
-        from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config  # noqa: PLC0415 - as above
-
-        config, _ = read_config(find_checkpoint(known.run_dir))
+    _require_path(known.run_dir)
+    module = _import("cura_torchrl.trainers.checkpoint")
+    config, _ = module.read_config(module.find_checkpoint(known.run_dir))
     return config.replace(run_dir=known.run_dir)
+
+
+def _require_path(path: Path | None) -> None:
+    # Before anything slow is imported; what the path holds is checked when it is read.
+    if path is not None and not path.exists():
+        msg = f"no checkpoint at {path}; accepted: a run's folder or a checkpoint's folder"
+        raise RunError(msg)
 
 
 def _parse(options: type[Any], command: str, arguments: list[str], default: Any = None) -> Any:
@@ -216,8 +228,12 @@ def _clean_stdout() -> Iterator[None]:
         os.close(kept)
 
 
-def _quieten_torchrl() -> None:
+def _import(name: str) -> Any:
+    """Return a module that needs torch, TorchRL or the simulator, which write to stdout while they are imported."""
+    with _clean_stdout():
+        module = importlib.import_module(name)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
+    return module
 
 
 def _as_text(result: dict[str, Any], indent: str = "") -> str:

@@ -41,7 +41,7 @@ class PPOConfig:
     critic_coeff: float = 1.0
     """Weight of the critic's loss [1]."""
     critic_warmup_frames: int = 0
-    """Frames for which only critic and estimator learn [1]: an actor that starts trained is not led by an untrained critic."""
+    """Frames for which only critic and estimator learn [1], so that no untrained critic leads a trained actor."""
     value_scale: float = 100.0
     """Magnitude of the returns [1]: the critic's network and its squared error are in units of it."""
     max_grad_norm: float = 1.0

@@ -121,7 +121,6 @@ class Player:
         """Close the worlds."""
         self._env.close()
 
-    @torch.no_grad()
     def play(self, chunk: int) -> list[Episode]:
         """Play one chunk of scenarios, each once.
 
@@ -134,20 +133,44 @@ class Player:
         size = self._config.chunk
         first = chunk * size
         torch.manual_seed(self._config.seed * 1_000_003 + chunk)  # random actions only; all else is deterministic
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            episodes = self._play(torch.arange(first, first + size))
+        episodes = play_episodes(self._env, self._policy, torch.arange(first, first + size))
         return episodes[: self._config.episodes - first]
 
-    def _play(self, indices: torch.Tensor) -> list[Episode]:
-        state = self._env.reset(episodes=indices)
+
+@torch.no_grad()
+def play_episodes(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    indices: torch.Tensor,
+    *,
+    watch: Callable[[TensorDictBase, torch.Tensor], None] | None = None,
+) -> list[Episode]:
+    """Play one scenario in each world, with the policy's mean action.
+
+    Args:
+        env: N worlds.
+        policy: Writes the action.
+        indices: Scenarios to play, int64, shape ``[N]``.
+        watch: Called with what the environment emits at the start and after every step, batch size ``[N]``, and with
+            the rows that were being played until then, bool, shape ``[N]``.
+
+    Returns:
+        How they were played, in the order of ``indices``.
+    """
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        state = env.reset(episodes=indices)
         outcomes: dict[int, Episode] = {}
         reached = torch.zeros(len(indices), dtype=torch.int64)
         is_over = torch.zeros(len(indices), dtype=torch.bool)
+        if watch is not None:
+            watch(state, ~is_over)
         while not is_over.all():
-            state = self._policy(state)
+            state = policy(state)
             # A world that is over stands still until the others are: what happens there no longer counts.
             state[keys.ACTION] = torch.where(is_over.unsqueeze(-1), 0.0, state[keys.ACTION])
-            after = self._env.step(state)["next"]
+            after = env.step(state)["next"]
+            if watch is not None:
+                watch(after, ~is_over)
             steps = after[keys.ELAPSED_STEPS].squeeze(-1)
             is_new = after[keys.SUCCESS][:, 0] & (reached == 0)
             reached = torch.where(is_new, steps, reached)
@@ -156,7 +179,7 @@ class Player:
                 outcomes[row] = _episode(int(indices[row]), after[row], int(reached[row]))
             is_over |= ended
             state = step_mdp(state)
-        return [outcomes[row] for row in range(len(indices))]
+    return [outcomes[row] for row in range(len(indices))]
 
 
 def _episode(index: int, last: TensorDictBase, reached: int) -> Episode:

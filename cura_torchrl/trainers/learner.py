@@ -12,7 +12,7 @@ from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDic
 from cura_torchrl import keys
 from cura_torchrl.modules.actor_critic import LOG_PROB_KEY
 from cura_torchrl.trainers.build import build_advantage, build_loss
-from cura_torchrl.trainers.diagnostics import explained_variance, risk_auroc
+from cura_torchrl.trainers.diagnostics import explained_variance, find_non_finite, risk_auroc
 from cura_torchrl.trainers.errors import NonFiniteError
 
 if TYPE_CHECKING:
@@ -102,8 +102,12 @@ class Learner:
             Means over the update's minibatches, and statistics of critic and collision estimator before the update.
 
         Raises:
-            NonFiniteError: If a loss or a gradient is not finite.
-        """  # noqa: DOC502 - raised by what this calls
+            NonFiniteError: If a number of the rollout, a loss or a gradient is not finite.
+        """
+        bad = find_non_finite(batch)
+        if bad is not None:
+            msg = f"{bad} of the rollout is not finite at {self.frames} frames; the last checkpoint is intact"
+            raise NonFiniteError(msg)
         data = batch.select(*self._advantage.in_keys, *_SAMPLE_KEYS).to(self._config.device)
         metrics = self._estimate(data)
         self._buffer.empty()

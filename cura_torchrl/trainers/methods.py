@@ -40,6 +40,9 @@ METHODS: dict[str, Method] = {
 }
 """The methods by name."""
 
+CURRICULUM = ((0, 0), (50_000, 1), (250_000, 2), (2_000_000, 4), (4_000_000, 6))
+"""(frames, K): the same schedule for every method, in frames and not by success, which would compare stages of it."""
+
 
 def method(name: str) -> TrainConfig:
     """Return the configuration that trains a method.
@@ -72,7 +75,7 @@ def method(name: str) -> TrainConfig:
             env,
             lidar=dataclasses.replace(env.lidar, occlusion=preset.occlusion),
             # Resets spread out over time; in lockstep the returns oscillate with the episode's phase.
-            task=dataclasses.replace(env.task, random_first_age=True),
+            task=dataclasses.replace(env.task, random_first_age=True, curriculum=CURRICULUM),
         ),
         map=MapConfig(decay=preset.decay),
         cura=CURAConfig(risk_coeff=preset.risk_coeff, uncertainty_coeff=preset.uncertainty_coeff),

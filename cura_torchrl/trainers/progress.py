@@ -97,16 +97,9 @@ def read_progress(path: Path) -> list[dict[str, float]]:
     """
     if not path.exists():
         return []
-    rows = []
-    with path.open(newline="", encoding="utf-8") as file:
-        for entry in csv.DictReader(file):
-            try:
-                row = {name: float(text) for name, text in entry.items() if text}
-            except (TypeError, ValueError):
-                continue
-            if "frames" in row:
-                rows.append(row)
-    return rows
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    whole = [line for line in lines if line.endswith("\n")]
+    return [{name: float(text) for name, text in entry.items() if text} for entry in csv.DictReader(whole)]
 
 
 def _rounded(row: dict[str, float]) -> dict[str, str]:

@@ -25,11 +25,10 @@ from cura_torchrl.trainers.checkpoint import (
 )
 from cura_torchrl.trainers.diagnostics import (
     RecentEpisodes,
-    find_non_finite,
     finished_episodes,
     rollout_statistics,
 )
-from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NonFiniteError, WorkerError
+from cura_torchrl.trainers.errors import CheckpointError, Interrupted, WorkerError
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.progress import Progress
 
@@ -38,13 +37,15 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import FrameType
 
-    from tensordict import TensorDictBase
     from torchrl.collectors import BaseCollector
 
     from cura_torchrl.envs.config import TaskConfig
     from cura_torchrl.trainers.config import TrainConfig
 
 logger = logging.getLogger(__name__)
+
+_DEATH_SIGNS = ("process failed", "failed to initialize", "process object is closed", "Cannot close a process")
+"""What TorchRL's and Python's errors say when a worker process has died."""
 
 
 def train(config: TrainConfig, *, resume: bool = False, init_from: Path | None = None) -> Path:
@@ -136,7 +137,10 @@ class _Run:
         progress = Progress(self.config, frames=frames)
         recent = RecentEpisodes(self.config.recent_episodes)
         try:
-            with build_collector(self.config, self.policy, frames_done=frames) as collector:
+            with (
+                _worker_errors(signals),
+                build_collector(self.config, self.policy, frames_done=frames) as collector,
+            ):
                 self._iterate(collector, signals, progress, recent)
         except Interrupted:
             # Raised only between updates or while collecting, so what is saved is the end of a whole update.
@@ -147,17 +151,16 @@ class _Run:
         return self._save()
 
     def sync(self) -> None:
-        # In place: workers have this memory mapped, so no message has to reach them, and none can be waited for in vain.
+        # In place: workers have this memory mapped, so no message has to reach them, and none is waited for in vain.
         if self.policy is not self.learner.networks.actor:
             self.policy.load_state_dict(self.learner.networks.actor.state_dict())
 
     def _iterate(self, collector: BaseCollector, signals: _Signals, progress: Progress, recent: RecentEpisodes) -> None:
         while self.learner.frames < self.config.total_frames:
             started = time.monotonic()
-            with signals.raising(), _worker_errors():
+            with signals.raising():
                 batch = collector.next()
             collected = time.monotonic()
-            _require_finite(batch, self.learner.frames)
             recent.extend(finished_episodes(batch))
             row = {
                 "frames": self.learner.frames + batch.numel(),
@@ -240,19 +243,15 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _worker_errors() -> Iterator[None]:
-    # TorchRL tells of a process that died by a RuntimeError, after the worker's own traceback has been printed.
+def _worker_errors(signals: _Signals) -> Iterator[None]:
+    # TorchRL tells of a process that died by one of these, after the worker's own traceback has been printed. A signal
+    # to the whole process group ends the workers too.
     try:
         yield
-    except RuntimeError as error:
-        if "process failed" not in str(error):
+    except (RuntimeError, ValueError, EOFError, ConnectionError) as error:
+        if not isinstance(error, (EOFError, ConnectionError)) and not any(sign in str(error) for sign in _DEATH_SIGNS):
             raise
-        msg = f"{error} The last checkpoint is intact; go on with --resume"
+        with signals.raising():
+            pass
+        msg = f"a process that collects has died ({error}); the last checkpoint is intact, go on with --resume"
         raise WorkerError(msg) from None
-
-
-def _require_finite(batch: TensorDictBase, frames: int) -> None:
-    bad = find_non_finite(batch)
-    if bad is not None:
-        msg = f"{bad} of the rollout is not finite at {frames} frames; the last checkpoint is intact"
-        raise NonFiniteError(msg)

@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 
 from cura_torchrl.envs.config import require
 from cura_torchrl.envs.mdp import geometry
-from cura_torchrl.envs.mdp.philox import counter_uniforms
 
 if TYPE_CHECKING:
     from cura_torchrl.envs.config import ScenarioConfig, Stream
@@ -260,7 +260,11 @@ def _uniforms(
     require(not (index < 0).any(), "episodes", episodes, "indices that are not negative")
     num_slot_draws = 3 * OBSTACLE_SLOTS
     count = len(_DRAWS) + num_slot_draws + 2 * OBSTACLE_SLOTS * config.num_fallbacks
-    uniform = torch.from_numpy(counter_uniforms((seed, _STREAM_IDS[stream]), index, count)).to(episodes.device)
+    key = np.array([seed, _STREAM_IDS[stream]], dtype=np.uint64)
+    # The counter's first word counts the blocks of an episode's draws: the episode is the second.
+    streams = [np.random.Philox(key=key, counter=[0, episode, 0, 0]) for episode in index.tolist()]
+    draws = np.array([np.random.Generator(bits).random(count) for bits in streams]).reshape(len(index), count)
+    uniform = torch.from_numpy(draws).to(episodes.device)
     num_named = len(_DRAWS)
     named, slots, place = uniform.tensor_split((num_named, num_named + num_slot_draws), -1)
     return (

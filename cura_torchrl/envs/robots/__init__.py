@@ -1,1 +1,1 @@
-
+"""The robot: its model and limits, kinematics, control, and pushers without learning."""

@@ -6,13 +6,17 @@ TCP's workspace, by the joint limits, and by the torque that it can ask for.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 
-from cura_torchrl.envs.config import PhysicsConfig, RobotConfig
 from cura_torchrl.envs.mdp import geometry
 from cura_torchrl.envs.robots import ridgeback_franka as model
 from cura_torchrl.envs.robots.kinematics import ArmKinematics, damped_least_squares
+
+if TYPE_CHECKING:
+    from cura_torchrl.envs.config import PhysicsConfig, RobotConfig
 
 BASE_DOF = len(model.BASE_JOINTS)
 
@@ -44,6 +48,7 @@ class ImpedanceController:
         self._lower, self._upper = np.array(model.JOINT_LOWER), np.array(model.JOINT_UPPER)
         self._speed = np.array(model.VELOCITY_LIMIT)
         self._ramp = self.period * np.array([robot.max_base_acceleration] * 2 + [robot.max_base_yaw_acceleration])
+        self._speed_bound = robot.max_base_speed**2 * (1.0 + 1e-9)  # the margin is for rounding
         self.reference = np.tile(np.array(model.HOME), (num_worlds, 1))
         self.base_command = np.zeros((num_worlds, BASE_DOF))
         self._base_target = np.zeros((num_worlds, BASE_DOF))
@@ -110,8 +115,7 @@ class ImpedanceController:
         centre = arm_position + self._lag * arm_velocity
         lower, upper = np.maximum(self._lower, centre - self._reach), np.minimum(self._upper, centre + self._reach)
         np.minimum(np.maximum(reference, lower, out=reference), upper, out=reference)
-        ramp = self._base_target[rows] - command
-        command += np.minimum(np.maximum(ramp, -self._ramp), self._ramp)
+        command += self._ramp_step(command, self._base_target[rows])
         force = np.empty_like(position)
         force[:, :BASE_DOF] = self._damping[:BASE_DOF] * (_to_world(command, position[:, 2]) - velocity[:, :BASE_DOF])
         error = reference - arm_position - self.period * arm_velocity
@@ -120,6 +124,17 @@ class ImpedanceController:
         arm = torque[:, BASE_DOF:]
         np.minimum(np.maximum(arm, -self._torque_limit, out=arm), self._torque_limit, out=arm)
         return torque
+
+    def _ramp_step(self, command: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Return the change of the base's velocity command in one tick, within the acceleration of each axis."""
+        ramp = target - command
+        step = np.minimum(np.maximum(ramp, -self._ramp), self._ramp)
+        is_fast = (command[:, 0] + step[:, 0]) ** 2 + (command[:, 1] + step[:, 1]) ** 2 > self._speed_bound
+        if is_fast.any():
+            # Axis by axis the way between two points of the disc of speeds may lead out of it; straight it cannot.
+            planar = ramp[is_fast, :2]
+            step[is_fast, :2] = planar / np.maximum(np.abs(planar) / self._ramp[:2], 1.0).max(axis=1, keepdims=True)
+        return step
 
     def solve_ik(self) -> None:
         """Set the rate of every joint reference from the commanded twist; due every ``ik_ticks`` ticks."""
@@ -132,21 +147,21 @@ class ImpedanceController:
         self._rate = np.clip(rate.numpy(), -self._speed, self._speed)
 
     def _linear(self, tcp: torch.Tensor) -> torch.Tensor:
-        """Velocity that moves the TCP's reference as commanded, within the workspace, and follows it [m/s]."""
+        """Return the velocity that moves the TCP's reference as commanded, and follows it [m/s]."""
         config, horizon = self.config, self.ik_ticks * self.period
         bounds = np.array([config.workspace_x, config.workspace_y, config.workspace_z])
         upper = np.tile(bounds[:, 1], (len(tcp), 1))
         upper[:, 2] = self._height_limit
         at, before = tcp.numpy(), self.tcp_reference
         after = np.clip(before + horizon * self._tcp_target, bounds[:, 0], upper)
-        # Not further from where the joints' reference can be than the leash: it must not wind up against a blocked object.
+        # On a leash to where the joints' reference can be: it must not wind up against a blocked object.
         after = np.clip(after, at - config.tcp_leash, at + config.tcp_leash)
         self.tcp_reference = after
         follow = (after - before) / horizon + config.position_gain * (after - at)
         return torch.from_numpy(np.clip(follow, -2.0 * config.max_tcp_speed, 2.0 * config.max_tcp_speed))
 
     def _angular(self, tcp: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
-        """Angular velocity that turns the hand's axis towards the object's centre, within limits [rad/s]."""
+        """Return the angular velocity that turns the hand's axis to the object's centre, within limits [rad/s]."""
         config = self.config
         offset = torch.from_numpy(self._object_xy_b) - tcp[:, :2]
         ahead = torch.stack([offset[:, 0].clamp_min(1e-3), offset[:, 1]], dim=-1)
@@ -168,8 +183,8 @@ def hand_rotation(yaw: torch.Tensor, tilt: float) -> torch.Tensor:
         Rotation matrices whose third column is the hand's axis, shape ``[N, 3, 3]``.
 
     Examples:
-        >>> hand_rotation(torch.zeros(1), 0.0)[0, :, 2].tolist()
-        [1.0, 0.0, 0.0]
+        >>> hand_rotation(torch.zeros(1), 0.0)[0].round().int().tolist()
+        [[0, 0, 1], [0, -1, 0], [1, 0, 0]]
     """
     zero, pitch = torch.zeros_like(yaw), torch.full_like(yaw, tilt)
     axis = torch.stack([pitch.cos() * yaw.cos(), pitch.cos() * yaw.sin(), -pitch.sin()], dim=-1)

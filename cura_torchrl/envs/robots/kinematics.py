@@ -19,7 +19,8 @@ class ArmKinematics:
     """
 
     def __init__(self) -> None:
-        self._chain = pk.build_serial_chain_from_urdf(URDF.read_bytes(), TCP_LINK, root_link_name=BASE_LINK).to(dtype=torch.float64)
+        chain = pk.build_serial_chain_from_urdf(URDF.read_bytes(), TCP_LINK, root_link_name=BASE_LINK)
+        self._chain = chain.to(dtype=torch.float64)
 
     def forward(self, joint_position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return where the TCP is and how it moves with the joints.
@@ -37,7 +38,9 @@ class ArmKinematics:
         return position, pose[:, :3, :3], jacobian
 
 
-def damped_least_squares(jacobian: torch.Tensor, twist: torch.Tensor, damping: float) -> tuple[torch.Tensor, torch.Tensor]:
+def damped_least_squares(
+    jacobian: torch.Tensor, twist: torch.Tensor, damping: float
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the joint velocity that follows a twist, and the projector onto what is left free.
 
     The solution is ``J^T (J J^T + damping^2 I)^-1 twist``.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from importlib import resources
+from pathlib import Path
 
-URDF = resources.files("cura_torchrl.envs.robots") / "assets" / "ridgeback_franka.urdf"
+URDF = Path(__file__).parent / "assets" / "ridgeback_franka.urdf"
 """The model. Both PyBullet and pytorch-kinematics read this file."""
 
 BASE_JOINTS = ("base_x", "base_y", "base_yaw")
@@ -20,7 +20,10 @@ CHASSIS_SIZE = (0.960, 0.793)
 """Length and width of the base [m]; Clearpath Ridgeback data sheet."""
 
 BASE_LINK_HEIGHT = 0.026
-"""Height of ``base_link`` above the ground [m]; ridgeback_description. The base frame used throughout lies below it, on the ground."""
+"""Height of ``base_link`` above the ground [m]; ridgeback_description.
+
+The base frame used throughout lies below it, on the ground.
+"""
 
 JOINT_LOWER = (-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671)
 JOINT_UPPER = (2.9671, 1.8326, 2.9671, 0.0, 2.9671, 3.8223, 2.9671)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 
 from cura_torchrl.envs.mdp import geometry
 
@@ -54,7 +53,8 @@ def step_cost(obstacles: torch.Tensor, radius: torch.Tensor, soft_margin: float)
     point = centres.expand(*obstacles.shape[:2], *centres.shape)
     local = geometry.to_frame(obstacles[:, :, None, None, :3].expand(*point.shape[:-1], 3), point)
     outside = (local.abs() - obstacles[:, :, None, None, 3:] / 2).clamp_min(0.0)
-    distance = torch.where(obstacles[:, :, 3, None, None] > 0, geometry.norm(outside), torch.full_like(outside[..., 0], _FAR))
+    is_there = obstacles[:, :, 3, None, None] > 0
+    distance = torch.where(is_there, geometry.norm(outside), torch.full_like(outside[..., 0], _FAR))
     clearance = distance.amin(1) - radius[:, None, None]
     return 1.0 + 4.0 * (1.0 - clearance / soft_margin).clamp(0.0, 1.0) + torch.where(clearance < 0, 60.0, 0.0)
 
@@ -70,10 +70,10 @@ def cost_to_go(cost: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
         Accumulated cost in cell lengths [1], shape ``[N, W, H]``.
     """
     value = torch.full_like(cost, _FAR * _FAR)
-    rows = torch.arange(len(cost))
-    value[rows, *cell_of(goal)] = 0.0
+    column, row = cell_of(goal)
+    value[torch.arange(len(cost)), column, row] = 0.0
     for _ in range(2 * (_SHAPE[0] + _SHAPE[1])):
-        padded = F.pad(value, (1, 1, 1, 1), value=_FAR * _FAR)
+        padded = torch.nn.functional.pad(value, (1, 1, 1, 1), value=_FAR * _FAR)
         around = [
             padded[:, 1 + dx : 1 + dx + _SHAPE[0], 1 + dy : 1 + dy + _SHAPE[1]] + cost * (dx * dx + dy * dy) ** 0.5
             for dx, dy in _NEIGHBOURS

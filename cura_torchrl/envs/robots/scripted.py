@@ -1,9 +1,10 @@
-"""Pushers without learning: proof that physics, kinematics and control can do the job, and a reference to compare with."""
+"""Pushers without learning: proof that physics, kinematics and control can do the job, and a reference."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from cura_torchrl import keys
@@ -11,6 +12,16 @@ from cura_torchrl.envs.config import RobotConfig
 from cura_torchrl.envs.mdp import geometry
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.robots import route
+
+if TYPE_CHECKING:
+    from tensordict import TensorDictBase
+
+
+_CHASSIS_RADIUS = 0.6
+"""Radius of a disc that all but the corners of the chassis lie in [m]."""
+
+_BODY_CLEARANCE = 0.08
+"""Distance that the avoider's discs keep from obstacles [m]."""
 
 
 class ScriptedPusher(TensorDictModuleBase):
@@ -29,7 +40,7 @@ class ScriptedPusher(TensorDictModuleBase):
         torch.Size([2, 6])
     """
 
-    def __init__(self, robot: RobotConfig | None = None, *, speed: float = 0.6) -> None:
+    def __init__(self, robot: RobotConfig | None = None, *, speed: float = 0.7) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
         self.out_keys = [keys.ACTION]
@@ -37,18 +48,26 @@ class ScriptedPusher(TensorDictModuleBase):
         self.speed = speed
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action for every row."""
+        """Write the action for every row.
+
+        Args:
+            tensordict: Holds the in_keys, batch ``[N]``.
+
+        Returns:
+            The same tensordict.
+        """
         parts = {name: tensordict[keys.OBSERVATION][..., part] for name, part in OBSERVATION_SLICES.items()}
         waypoint = self._waypoint(tensordict, parts)
         tensordict[keys.ACTION] = self._action(parts, waypoint)
         return tensordict
 
     def _waypoint(self, tensordict: TensorDictBase, parts: dict[str, torch.Tensor]) -> torch.Tensor:  # noqa: ARG002
-        """Where the object should go next, base frame [m], shape ``[*, 2]``."""
+        """Return where the object should go next, base frame [m], shape ``[*, 2]``."""
         return parts["goal_position"]
 
     def _action(self, parts: dict[str, torch.Tensor], waypoint: torch.Tensor) -> torch.Tensor:
-        tcp, centre, half = parts["tcp_position"][..., :2], parts["object_position"][..., :2], parts["object_position"][..., 2:]
+        tcp, centre = parts["tcp_position"][..., :2], parts["object_position"][..., :2]
+        half = parts["object_position"][..., 2:]
         to_goal = waypoint - centre
         distance = to_goal.norm(dim=-1, keepdim=True)
         along = to_goal / distance.clamp_min(1e-6)
@@ -60,22 +79,31 @@ class ScriptedPusher(TensorDictModuleBase):
         standoff = 1.25 * half + 0.1
         behind = (ahead > 0.75 * half) & (aside.abs() < 0.8 * half)
         sideways = (2.0 * aside).clamp(-0.35, 0.35)
-        centred = (1.0 - aside.abs() / (0.5 * half + 1e-6)).clamp(0.15, 1.0)
+        centred = (1.0 - aside.abs() / (0.8 * half + 1e-6)).clamp(0.15, 1.0)
         gap = (ahead - half).clamp_min(0.0)
         forward = torch.minimum(torch.full_like(distance, self.speed), 0.12 + 1.2 * distance) * centred
         forward = torch.where(gap > 0.15, torch.minimum(forward, 0.2 + gap), forward)
         retreat = (1.5 * (ahead - standoff)).clamp(-0.6, 0.3)
-        velocity = torch.where(behind, forward, retreat) * along + torch.where(behind, sideways, 2.0 * sideways) * across
+        sideways = torch.where(behind, sideways, 2.0 * sideways)
+        velocity = torch.where(behind, forward, retreat) * along + sideways * across
         velocity = torch.where(distance < 0.03, torch.zeros_like(velocity), velocity)
+        # Half a diagonal: whichever way the object is turned.
+        velocity = self._keep_clear(centre, 1.42 * half[..., 0], velocity)
         return self._share(tcp, velocity, turn)
 
+    def _keep_clear(self, centre: torch.Tensor, radius: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:  # noqa: ARG002
+        """Return the velocity of a disc, base frame [m/s], less what would bring it into an obstacle."""
+        return velocity
+
     def _share(self, tcp: torch.Tensor, velocity: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
-        """Split a TCP velocity between base and arm: the base carries it, the arm returns to its middle."""
+        """Return the action for a TCP velocity: the base carries it, the arm returns to its middle."""
         spin = (1.2 * turn).clamp(-0.6, 0.6)
         home = tcp.new_tensor([0.9, 0.0])
         arm = (1.0 * (home - tcp)).clamp(-0.2, 0.2)
         carried = torch.cat([-spin * tcp[..., 1:], spin * tcp[..., :1]], dim=-1)
-        base = (velocity - carried - arm) / self.robot.max_base_speed
+        base = velocity - carried - arm
+        base = self._keep_clear(torch.zeros_like(tcp), torch.full_like(turn[..., 0], _CHASSIS_RADIUS), base)
+        base = base / self.robot.max_base_speed
         base = base / base.norm(dim=-1, keepdim=True).clamp_min(1.0)
         lift = torch.zeros_like(turn)
         return torch.cat([base, spin / self.robot.max_base_yaw_rate, arm / self.robot.max_tcp_speed, lift], dim=-1)
@@ -94,7 +122,7 @@ class ScriptedAvoider(ScriptedPusher):
     """
 
     def __init__(
-        self, robot: RobotConfig | None = None, *, speed: float = 0.6, margin: float = 0.45, look_ahead: float = 1.2
+        self, robot: RobotConfig | None = None, *, speed: float = 0.7, margin: float = 0.45, look_ahead: float = 1.2
     ) -> None:
         super().__init__(robot, speed=speed)
         self.in_keys = [keys.OBSERVATION, keys.OBSTACLES, keys.SENSOR_POSE]
@@ -102,6 +130,7 @@ class ScriptedAvoider(ScriptedPusher):
         self.look_ahead = look_ahead
         self._known: torch.Tensor | None = None
         self._value = torch.empty(0)
+        self._obstacles_b = torch.empty(0)
 
     def _waypoint(self, tensordict: TensorDictBase, parts: dict[str, torch.Tensor]) -> torch.Tensor:
         base = tensordict[keys.SENSOR_POSE]
@@ -109,18 +138,40 @@ class ScriptedAvoider(ScriptedPusher):
         centre = geometry.from_frame(base, parts["object_position"][..., :2])
         radius = parts["object_position"][..., 2] + self.margin
         self._plan(tensordict[keys.OBSTACLES], goal, radius)
+        self._obstacles_b = _in_base_frame(base, tensordict[keys.OBSTACLES])
         cells = round(self.look_ahead / route.CELL)
         ahead = route.follow(self._value, centre, cells)
         is_near = geometry.norm(goal - centre) < self.look_ahead
         return geometry.to_frame(base, torch.where(is_near[..., None], goal, ahead))
 
     def _plan(self, obstacles: torch.Tensor, goal: torch.Tensor, radius: torch.Tensor) -> None:
-        # The goal is read back from the base frame: round it, or its last bits would ask for a new plan in every step.
-        scene = torch.cat([obstacles.flatten(1), goal.mul(20).round().div(20), radius[:, None]], dim=-1)
+        scene = torch.cat([obstacles.flatten(1), goal, radius[:, None]], dim=-1)
         if self._known is None or self._known.shape != scene.shape:
-            self._known, self._value = torch.full_like(scene, torch.nan), torch.empty(len(scene), *route.cell_centres().shape[:2])
-        changed = (~(self._known == scene).all(-1)).nonzero().flatten()
+            self._known = torch.full_like(scene, torch.nan)
+            self._value = scene.new_empty(len(scene), *route.cell_centres().shape[:2])
+        # Goal and radius are read back from the base frame: their last bits must not ask for a new plan in every step.
+        is_known = ((self._known - scene).abs() < 0.5 * route.CELL).all(-1)
+        changed = (~is_known).nonzero().flatten()
         if len(changed):
             cost = route.step_cost(obstacles[changed], radius[changed], soft_margin=0.6)
             self._value[changed] = route.cost_to_go(cost, goal[changed])
             self._known[changed] = scene[changed]
+
+    def _keep_clear(self, centre: torch.Tensor, radius: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
+        for slot in range(self._obstacles_b.shape[1]):
+            obstacle = self._obstacles_b[:, slot]
+            local = geometry.to_frame(obstacle[:, :3], centre)
+            half = obstacle[:, 3:] / 2
+            outward = local - local.clamp(-half, half)
+            distance = outward.norm(dim=-1, keepdim=True)
+            inward = geometry.rotate(-outward / distance.clamp_min(1e-6), obstacle[:, 2])
+            # It may close in only as fast as it can stop: proportionally to the gap, and back out of a negative one.
+            allowed = 1.5 * (distance - radius[:, None] - _BODY_CLEARANCE)
+            excess = ((velocity * inward).sum(-1, keepdim=True) - allowed).clamp_min(0.0)
+            velocity = velocity - torch.where(half > 0, excess, 0.0) * inward
+        return velocity
+
+
+def _in_base_frame(base: torch.Tensor, obstacles: torch.Tensor) -> torch.Tensor:
+    position = geometry.to_frame(base[:, None].expand(-1, obstacles.shape[1], -1), obstacles[..., :2])
+    return torch.cat([position, obstacles[..., 2:3] - base[:, None, 2:], obstacles[..., 3:]], dim=-1)

@@ -1,1 +1,1 @@
-
+"""The simulators, and the batched state they return."""

@@ -1,7 +1,8 @@
 """PyBullet: N worlds, one client each, stepped in lockstep. The only file that knows the engine.
 
-World gravity is zero: a gravity-compensated arm then needs no inverse dynamics, and the object's weight is an external force
-on its centre of mass in every tick. A reset rebuilds the world from nothing, so an episode cannot depend on earlier ones.
+World gravity is zero: a gravity-compensated arm then needs no inverse dynamics, and the object's weight is an external
+force on its centre of mass in every tick. A reset rebuilds the world from nothing, so an episode cannot depend on
+earlier ones.
 """
 
 from __future__ import annotations
@@ -30,9 +31,14 @@ _RAY_GROUP = 1
 _MAX_RAYS = 8192
 """Rays in one call; Bullet returns nothing for 16,384 numpy rays or more."""
 
-
 _BLOCK = 8
-"""Worlds stepped together between two IK solutions: few enough for their state to stay in the cache, enough to share numpy's overhead."""
+"""Worlds stepped together between two IK solutions.
+
+Few enough for their state to stay in the cache, enough to share numpy's overhead.
+"""
+
+_BASE_LINKS = ("base_slide_x", "base_slide_y", "base_link")
+"""The robot's first links; all later ones belong to the arm."""
 
 
 class SimulationError(RuntimeError):
@@ -49,7 +55,7 @@ class TorqueLaw(Protocol):
         ...
 
     def torques(self, rows: slice, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Return joint torques of some worlds, shape ``[B, J]``, from joint positions and velocities of the same shape."""
+        """Return joint torques ``[B, J]`` of some worlds from joint positions and velocities of the same shape."""
         ...
 
 
@@ -160,10 +166,12 @@ class BulletWorlds:
         )  # fmt: skip
         inertia = mass * edge**2 / 6  # solid cube
         bullet.changeDynamics(
-            body, -1, lateralFriction=scene.floor_friction[row].item(), restitution=0.0, linearDamping=0.0, angularDamping=0.0,
-            localInertiaDiagonal=[inertia] * 3, activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client,
+            body, -1, lateralFriction=scene.floor_friction[row].item(), restitution=0.0, linearDamping=0.0,
+            angularDamping=0.0, localInertiaDiagonal=[inertia] * 3,
+            activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client,
         )  # fmt: skip
-        bullet.setCollisionFilterGroupMask(body, -1, OBJECT, _RAY_GROUP | ROBOT | OBSTACLE | FLOOR, physicsClientId=client)
+        seen_by = _RAY_GROUP | ROBOT | OBSTACLE | FLOOR
+        bullet.setCollisionFilterGroupMask(body, -1, OBJECT, seen_by, physicsClientId=client)
         self._weight[world] = mass * self._physics.gravity
         self._com_offset[world] = offset
         return body
@@ -180,7 +188,8 @@ class BulletWorlds:
         client, (x, y, yaw) = self._clients[world], pose
         shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=[edge / 2] * 3, physicsClientId=client)
         body = bullet.createMultiBody(
-            0, shape, basePosition=[x, y, edge / 2], baseOrientation=[0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)], physicsClientId=client
+            0, shape, basePosition=[x, y, edge / 2], baseOrientation=[0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)],
+            physicsClientId=client,
         )  # fmt: skip
         bullet.changeDynamics(body, -1, restitution=0.0, physicsClientId=client)
         bullet.setCollisionFilterGroupMask(body, -1, OBSTACLE, _RAY_GROUP | ROBOT | OBJECT, physicsClientId=client)
@@ -213,8 +222,9 @@ class BulletWorlds:
                 self._advance_block(law, rows, min(law.ik_ticks, ticks - start))
             self._note_contacts()
         state = self._joint_state
-        if not np.isfinite(state).all():
-            msg = f"worlds {np.flatnonzero(~np.isfinite(state).all(axis=(1, 2))).tolist()} have joint states that are not finite"
+        finite = np.isfinite(state).all(axis=(1, 2))
+        if not finite.all():
+            msg = f"worlds {np.flatnonzero(~finite).tolist()} have joint states that are not finite"
             raise SimulationError(msg)
 
     def _advance_block(self, law: TorqueLaw, rows: slice, ticks: int) -> None:
@@ -251,7 +261,7 @@ class BulletWorlds:
         self._joint_state[world] = np.array([entry[:2] for entry in entries]).T
 
     def state(self) -> WorldState:
-        """Return the state of every world.
+        """Return the state of every world, batch ``[N]``.
 
         Raises:
             SimulationError: If a pose is not finite.
@@ -282,7 +292,9 @@ class BulletWorlds:
             contact=torch.from_numpy(self._contact.copy()),
         )
 
-    def cast(self, origin: np.ndarray, ends: np.ndarray, *, see_object: bool, rows: list[int] | None = None) -> np.ndarray:
+    def cast(
+        self, origin: np.ndarray, ends: np.ndarray, *, see_object: bool, rows: list[int] | None = None
+    ) -> np.ndarray:
         """Cast rays, one call per world. Rays never see the robot.
 
         Args:
@@ -299,21 +311,20 @@ class BulletWorlds:
         """
         num_rays = ends.shape[1]
         if num_rays > _MAX_RAYS or not (np.isfinite(origin).all() and np.isfinite(ends).all()):
-            msg = f"{num_rays} rays, finite: {np.isfinite(ends).all()}; accepted: at most {_MAX_RAYS} finite rays a world"
+            finite = bool(np.isfinite(origin).all() and np.isfinite(ends).all())
+            msg = f"{num_rays} rays, finite: {finite}; accepted: at most {_MAX_RAYS} finite rays a world"
             raise SimulationError(msg)
         mask = OBSTACLE | (OBJECT if see_object else 0)
         fractions = np.empty(ends.shape[:2])
         starts = np.ascontiguousarray(np.broadcast_to(origin[:, None], ends.shape))
         for row, world in enumerate(range(self.num_worlds) if rows is None else rows):
-            hits = bullet.rayTestBatch(starts[row], ends[row], collisionFilterMask=mask, physicsClientId=self._clients[world])
+            client = self._clients[world]
+            hits = bullet.rayTestBatch(starts[row], ends[row], collisionFilterMask=mask, physicsClientId=client)
             if len(hits) != num_rays:
                 msg = f"Bullet answered {len(hits)} of {num_rays} rays in world {world}"
                 raise SimulationError(msg)
             fractions[row] = [hit[2] for hit in hits]
         return fractions
-
-
-_BASE_LINKS = ("base_slide_x", "base_slide_y", "base_link")
 
 
 def _rotate(quaternion: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:

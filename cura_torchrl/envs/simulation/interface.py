@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import torch
-
+import torch
 
 
 @dataclass
 class WorldState:
-    """Batched state of N worlds, float64, world frame unless said otherwise. Fresh tensors: nothing aliases the simulator."""
+    """State of N worlds, float64, world frame. Fresh tensors: nothing aliases the simulator."""
 
     base_pose: torch.Tensor
     """Base (x [m], y [m], yaw [rad]), shape ``[N, 3]``."""

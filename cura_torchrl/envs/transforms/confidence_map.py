@@ -89,6 +89,9 @@ class ConfidenceMap(Transform):
         [1.0]
     """
 
+    _stamps: torch.Tensor
+    _steps: torch.Tensor
+
     def __init__(
         self,
         config: MapConfig | None = None,
@@ -124,8 +127,8 @@ class ConfidenceMap(Transform):
         for name, table in tables.items():
             self.register_buffer(name, table, persistent=False)
         # +t: seen free in step t of the episode; -t: seen occupied in step t; 0: never seen. Whole, exact below 2**24.
-        self.register_buffer("_stamps", None, persistent=False)
-        self.register_buffer("_steps", None, persistent=False)
+        self.register_buffer("_stamps", torch.zeros(0, self.grid.num_rows, self.grid.num_columns), persistent=False)
+        self.register_buffer("_steps", torch.zeros(0), persistent=False)
         self._map_space: tuple[torch.Tensor, ...] = ()
         self._window_space: tuple[torch.Tensor, ...] = ()
         self._batch_shape = torch.Size([])
@@ -144,7 +147,7 @@ class ConfidenceMap(Transform):
         Returns:
             The same tensordict.
         """
-        if self._stamps is None:
+        if len(self._stamps) == 0:
             return self._reset(tensordict.empty(), tensordict)
         return self._call(tensordict)
 
@@ -152,9 +155,10 @@ class ConfidenceMap(Transform):
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         inputs = self._read(next_tensordict)
         num_rows = inputs[0].shape[0]
-        if self._stamps is None or self._stamps.shape[0] != num_rows:
-            known = "no map yet" if self._stamps is None else f"a map for batch {list(self._batch_shape)}"
-            msg = f"step with {num_rows} rows, but there is {known}; accepted: the batch of the last whole reset"
+        if len(self._stamps) != num_rows:
+            msg = (
+                f"step with {num_rows} rows, maps for {len(self._stamps)}; accepted: the batch of the last whole reset"
+            )
             raise ValueError(msg)
         return self._write(next_tensordict, self._observe(self._stamps, self._steps, inputs))
 
@@ -163,9 +167,9 @@ class ConfidenceMap(Transform):
         inputs = self._read(tensordict_reset)
         num_rows, device = inputs[0].shape[0], inputs[0].device
         mask = _get_reset(self._reset_key(), tensordict).expand(self._batch_shape).reshape(-1)
-        if self._stamps is None or self._stamps.shape[0] != num_rows or self._stamps.device != device:
+        if len(self._stamps) != num_rows or self._stamps.device != device:
             require(bool(mask.all()), "reset mask", mask.tolist(), "a whole reset where the batch or the device is new")
-            self._stamps = torch.zeros(num_rows, self.grid.num_rows, self.grid.num_columns, device=device)
+            self._stamps = torch.zeros(num_rows, *self._stamps.shape[1:], device=device)
             self._steps = torch.zeros(num_rows, device=device)
         rows = mask.nonzero().squeeze(-1)
         stamps = self._stamps.new_zeros(rows.numel(), *self._stamps.shape[1:])
@@ -260,7 +264,7 @@ class ConfidenceMap(Transform):
             return
         occupancy = stamp.clamp_(-1.0, 0.0).abs_().mul_(self._outside_robot)
         if len(inputs) > 2:
-            occupancy.mul_(visibility.outside_footprint(self._offsets, *inputs[1:], scratch[1:3]))
+            occupancy.mul_(visibility.outside_footprint(self._offsets, inputs[1], inputs[2], inputs[3], scratch[1:3]))
         if self.config.channels == "product":
             window[:, 0] *= occupancy
         else:

@@ -160,12 +160,9 @@ def test_robot_starts_with_its_tcp_behind_the_rear_face():
     gap = -local[:, 0] - scenario["object_edge"] / 2
     # The object's yaw stays within 0.6 rad < pi/4, so its own -x face is the rear one. With this reach no chassis is
     # so near that the robot has to be moved back: 0.9 - 0.48 = 0.42 m of arm ahead of it.
-    assert gap.min() >= 0.2 - 1e-12
-    assert gap.max() <= 0.6 + 1e-12
-    assert gap.min() < 0.21
-    assert gap.max() > 0.59
-    assert local[:, 1].abs().max() <= 0.5 + 1e-12
-    assert local[:, 1].abs().max() > 0.49
+    assert 0.2 - 1e-12 <= gap.min() < 0.21
+    assert 0.59 < gap.max() <= 0.6 + 1e-12
+    assert 0.49 < local[:, 1].abs().max() <= 0.5 + 1e-12
 
 
 @pytest.mark.parametrize("reach", [0.48, 0.7, 0.9])
@@ -344,11 +341,9 @@ def test_adversarial_obstacles_lie_on_the_line_from_the_object_now_to_the_goal()
     assert len(lateral) > 5000
     assert 0.29 < np.abs(lateral).max() <= 0.3 + 1e-12
     assert abs(lateral.mean()) < 0.02
-    assert along.min() >= 0
-    assert along.max() <= 1
+    assert 0 <= along.min() <= along.max() <= 1
     x = pose[..., 0][active]
-    assert x.min() >= 3
-    assert x.max() <= 11
+    assert 3 <= x.min() <= x.max() <= 11
 
 
 def test_uniform_obstacles_fill_the_region():

@@ -26,11 +26,14 @@ from cura_torchrl.envs.sensors import (
 GRID = MapGrid(extent_x=(-2.0, 2.0), extent_y=(-1.5, 1.5), resolution=0.1)
 
 
-def pose(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> torch.Tensor:
+def place(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> torch.Tensor:
+    """Return a batch of one pose."""
     return torch.tensor([[x, y, yaw]])
 
 
 class TestMapGrid:
+    """Where the cells are."""
+
     def test_cells_are_where_the_extent_says(self) -> None:
         """Catches an offset by the border row or by half a cell."""
         # x: 40 cells and two border rows; first cell -2 + 0.05. y: 30 cells, padded to 32.
@@ -60,6 +63,8 @@ class TestMapGrid:
 
 
 class TestScan:
+    """What a scan says."""
+
     def test_bad_ranges_see_nothing(self) -> None:
         """Catches a NaN that reads as free space."""
         cleaned = clean_scan(torch.tensor([math.nan, math.inf, -1.0, 12.0, 3.0]), 10.0)
@@ -70,17 +75,19 @@ class TestScan:
         directions = torch.stack(unit_vector(ray_angles(4)))
         # Sensor at (1, 2) turned left by 90 degrees; rays at -180, -90, 0, 90 degrees in the base frame point to world
         # -90, 0, 90, 180 degrees; ranges 1, 2, 3, 4.
-        x, y = scan_points(torch.tensor([[1.0, 2.0, 3.0, 4.0]]), pose(1.0, 2.0, math.pi / 2), directions)
+        x, y = scan_points(torch.tensor([[1.0, 2.0, 3.0, 4.0]]), place(1.0, 2.0, math.pi / 2), directions)
         torch.testing.assert_close(x, torch.tensor([[1.0, 3.0, 1.0, -3.0]]))
         torch.testing.assert_close(y, torch.tensor([[1.0, 2.0, 5.0, 2.0]]))
 
 
 class TestSeenFree:
+    """Which cells are seen free."""
+
     def test_a_wall_bounds_the_free_cells(self) -> None:
         """Catches a wrong margin: cells up to half a diagonal in front of the wall are free, none behind it."""
         scan = torch.full((1, 360), 1.0)
-        free = seen_free(GRID.row_x(), GRID.column_y(), scan, pose(), GRID.half_diagonal)[0]
-        # Along y = 0.05, cells at x = 0.05, 0.15, ...: distance < 1 - 0.0707 up to x = 0.85 (0.8515), not 0.95 (0.9513).
+        free = seen_free(GRID.row_x(), GRID.column_y(), scan, place(), GRID.half_diagonal)[0]
+        # Along y = 0.05, cells at x = 0.05, 0.15, ...: distance < 1 - 0.0707 up to x = 0.85 (0.8515), not 0.95.
         row = free[:, 15]
         assert row[21:30].tolist() == [1.0] * 9
         assert row[30:].sum() == 0.0
@@ -94,54 +101,63 @@ class TestSeenFree:
         """Catches a bearing that ignores the yaw, its sign or its turns, or a table that does not wrap."""
         scan = torch.zeros(1, 8)
         scan[0, 3] = 5.0  # bearing -pi + 3 pi / 4 = -45 degrees in the base frame, sector from -67.5 to -22.5
-        free = seen_free(GRID.row_x(), GRID.column_y(), scan, pose(0.01, 0.02, yaw), 0.0)[0, 1:41, :30]
-        x, y = np.meshgrid(-2 + (np.arange(40) + 0.5) * 0.1 - 0.01, -1.5 + (np.arange(30) + 0.5) * 0.1 - 0.02, indexing="ij")
+        free = seen_free(GRID.row_x(), GRID.column_y(), scan, place(0.01, 0.02, yaw), 0.0)[0, 1:41, :30]
+        x, y = np.meshgrid(
+            -2 + (np.arange(40) + 0.5) * 0.1 - 0.01, -1.5 + (np.arange(30) + 0.5) * 0.1 - 0.02, indexing="ij"
+        )
         bearing = np.degrees((np.arctan2(y, x) - yaw + math.pi) % (2 * math.pi) - math.pi)
         np.testing.assert_array_equal(free.numpy(), (bearing > -67.5) & (bearing < -22.5))
 
     def test_a_sensor_in_a_cell_centre_sees_its_cell(self) -> None:
         """Catches a division by zero at the sensor itself."""
-        free = seen_free(GRID.row_x(), GRID.column_y(), torch.ones(1, 8), pose(0.05, 0.05), GRID.half_diagonal)[0]
+        free = seen_free(GRID.row_x(), GRID.column_y(), torch.ones(1, 8), place(0.05, 0.05), GRID.half_diagonal)[0]
         assert free[21, 15] == 1.0
 
     def test_border_and_padding_are_never_seen(self) -> None:
         """Catches a border cell that gets seen, which would show outside of the extent."""
-        free = seen_free(GRID.row_x(), GRID.column_y(), torch.full((1, 8), 10.0), pose(1.9, 1.4), GRID.half_diagonal)[0]
+        free = seen_free(GRID.row_x(), GRID.column_y(), torch.full((1, 8), 10.0), place(1.9, 1.4), GRID.half_diagonal)[
+            0
+        ]
         assert free[[0, 41]].sum() == 0.0
         assert free[:, 30:].sum() == 0.0
         assert free[1:41, :30].sum() == 1200.0
 
     def test_work_space_changes_nothing(self) -> None:
         """Catches a result that depends on what the reused memory held."""
-        scan, place = torch.rand(3, 36) * 3, torch.rand(3, 3)
+        scan, poses = torch.rand(3, 36) * 3, torch.rand(3, 3)
         space = work_space((3, 42, 32), 1)
         space[0].fill_(math.nan)
-        fresh = seen_free(GRID.row_x(), GRID.column_y(), scan, place, GRID.half_diagonal)
-        reused = seen_free(GRID.row_x(), GRID.column_y(), scan, place, GRID.half_diagonal, space)
+        fresh = seen_free(GRID.row_x(), GRID.column_y(), scan, poses, GRID.half_diagonal)
+        reused = seen_free(GRID.row_x(), GRID.column_y(), scan, poses, GRID.half_diagonal, space)
         assert torch.equal(fresh, reused)
 
 
 class TestRectangles:
+    """Footprints."""
+
     def test_a_turned_rectangle_holds_what_it_should(self) -> None:
         """Catches a rotation by the wrong sign and swapped length and width."""
         # Centre (1, 0), turned left by 90 degrees, 2 m long, 0.5 m wide: |y| <= 1, |x - 1| <= 0.25.
         x, y = torch.tensor([[1.0, 1.0, 1.2, 1.3, 1.0]]), torch.tensor([[0.9, 1.1, 0.0, 0.0, -0.9]])
-        box, size = pose(1.0, 0.0, math.pi / 2), torch.tensor([[2.0, 0.5]])
+        box, size = place(1.0, 0.0, math.pi / 2), torch.tensor([[2.0, 0.5]])
         assert inside_rectangle(x, y, box, size).tolist() == [[True, False, True, False, True]]
         assert inside_rectangle(x, y, box, size, margin=0.15).all()
 
     def test_footprint_turns_with_the_window(self) -> None:
         """Catches a footprint that is computed in the wrong frame."""
-        # Sensor at (1, 1) turned left by 90 degrees; box centre (1, 3) in the world is 2 m straight ahead of it; its world
-        # yaw is 90 degrees too, so that its length of 1 m lies along the window's rows.
+        # Sensor at (1, 1) turned left by 90 degrees: the box centre (1, 3) is 2 m straight ahead of it.
         offsets = window_offsets(6, 1.0)  # -2.5 ... 2.5
-        outside = outside_footprint(offsets, pose(1.0, 1.0, math.pi / 2), pose(1.0, 3.0, math.pi / 2), torch.tensor([1.2, 1.2]))
+        outside = outside_footprint(
+            offsets, place(1.0, 1.0, math.pi / 2), place(1.0, 3.0, math.pi / 2), torch.tensor([1.2, 1.2])
+        )
         expected = torch.ones(6, 6)
         expected[4:, 2:4] = 0.0  # rows at 1.5 and 2.5, columns at -0.5 and 0.5
         assert torch.equal(outside[0], expected)
 
 
 class TestWindow:
+    """Which cell a window shows where."""
+
     def test_cells_of_points_match_the_grid(self) -> None:
         """Catches an off-by-one at the extent's edges."""
         x = torch.tensor([-2.0, 1.999, 2.0, -2.001, 0.0, math.nan])
@@ -155,29 +171,29 @@ class TestWindow:
     def test_a_quarter_turn_turns_the_window(self, quarter: int) -> None:
         """Catches a mirrored window or a rotation by the wrong sign."""
         offsets = window_offsets(10, 0.1)
-        straight = window_cells(GRID, offsets, pose(0.0, 0.0, 0.0))
-        turned = window_cells(GRID, offsets, pose(0.0, 0.0, quarter * math.pi / 2))
-        # A quarter turn to the left: (ahead u, left v) is world (-v, u), so turned[i, j] = straight[W - 1 - j, i], which is
+        straight = window_cells(GRID, offsets, place(0.0, 0.0, 0.0))
+        turned = window_cells(GRID, offsets, place(0.0, 0.0, quarter * math.pi / 2))
+        # A quarter turn to the left: (ahead u, left v) is world (-v, u), so turned[i, j] = straight[W - 1 - j, i], or
         # torch.rot90 by -1: what was ahead (large i) is now to the right (small j).
         assert torch.equal(torch.rot90(straight, -quarter, (1, 2)), turned)
 
     def test_rows_look_ahead_and_columns_to_the_left(self) -> None:
         """Catches swapped axes."""
-        cells = window_cells(GRID, window_offsets(4, 0.1), pose())[0]
+        cells = window_cells(GRID, window_offsets(4, 0.1), place())[0]
         rows, columns = cells // 32, cells % 32
         # x = 0.15 is in row 1 + floor(2.15 / 0.1) = 22, y = 0.15 in column floor(1.65 / 0.1) = 16.
         assert rows[:, 0].tolist() == [19, 20, 21, 22]
         assert columns[0].tolist() == [13, 14, 15, 16]
 
-    @pytest.mark.parametrize("place", [(50.0, 0.0), (-50.0, 0.0), (0.0, 50.0), (0.0, -50.0), (1e4, 1e4), (500.0, 1.6)])
-    def test_far_outside_shows_only_outside_cells(self, place: tuple[float, float]) -> None:
+    @pytest.mark.parametrize("where", [(50.0, 0.0), (-50.0, 0.0), (0.0, 50.0), (0.0, -50.0), (1e4, 1e4), (500.0, 1.6)])
+    def test_far_outside_shows_only_outside_cells(self, where: tuple[float, float]) -> None:
         """Catches an index that comes back into the map, from however far."""
-        cells = window_cells(GRID, window_offsets(10, 0.1), pose(*place, 0.3))
+        cells = window_cells(GRID, window_offsets(10, 0.1), place(*where, 0.3))
         assert torch.isin(cells // 32, torch.tensor([0, 41])).all()
 
     def test_half_outside_shows_both(self) -> None:
         """Catches a clamp that repeats the map's edge."""
-        cells = window_cells(GRID, window_offsets(10, 0.1), pose(0.0, 1.5, 0.0))[0]
+        cells = window_cells(GRID, window_offsets(10, 0.1), place(0.0, 1.5, 0.0))[0]
         rows = cells // 32
         assert (rows[:, :5] >= 1).all()
         assert (rows[:, :5] <= 40).all()

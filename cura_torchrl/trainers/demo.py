@@ -1,0 +1,354 @@
+"""The demo: two trained policies on the same scenes, a page to look at, and a few iterations of training."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import logging
+import math
+import multiprocessing
+import queue
+import shutil
+import sys
+import webbrowser
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import closing, contextmanager
+from pathlib import Path  # noqa: TC003 - doctest
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch
+from tqdm import tqdm
+
+from cura_torchrl.trainers import figures, render
+from cura_torchrl.trainers.build import load_encoder
+from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, load_policy
+from cura_torchrl.trainers.demo_config import DemoConfig
+from cura_torchrl.trainers.errors import RunError, UnavailableError
+from cura_torchrl.trainers.evaluate import summarise
+from cura_torchrl.trainers.info import git_commit, hardware, shipped_methods, versions
+from cura_torchrl.trainers.methods import METHODS
+from cura_torchrl.trainers.page import Card, make_page
+from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
+from cura_torchrl.trainers.recording import Recording, choose_scenes, record
+from cura_torchrl.trainers.train import most_obstacles, train
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from cura_torchrl.envs.config import TaskConfig
+    from cura_torchrl.trainers.checkpoint import LoadedPolicy
+    from cura_torchrl.trainers.config import TrainConfig
+    from cura_torchrl.trainers.recording import Scene
+
+__all__ = ["DemoConfig", "demo"]
+
+logger = logging.getLogger(__name__)
+
+PAGE_NAME = "index.html"
+"""File of the demo's folder that is looked at."""
+TRAINING_FOLDER = "training"
+"""Folder of the demo's folder that training writes to."""
+_FRAME_TIME = 0.1
+"""Time for which a frame of a telling scene is shown [s]; the others have half the frames."""
+_FIRST_RATE = 1e-4
+"""Largest learning rate to go on with where none is known: Adam has to find its moments again [1]."""
+_Pair = tuple[Recording, Recording]
+_T = TypeVar("_T")
+
+
+def demo(config: DemoConfig) -> Path:
+    """Play, write the page, train on, and add the curves to the page.
+
+    Args:
+        config: Policies, scenes and amount of training.
+
+    Returns:
+        The page.
+
+    Raises:
+        RunError: If weights or scenes are missing.
+    """  # noqa: DOC502 - raised by what this calls
+    loaded = [_load(name, config) for name in config.policies]
+    task = _task(config, loaded[0])
+    scenes = _scenes(config, task)
+    config.run_dir.mkdir(parents=True, exist_ok=True)
+    with _workers(config.num_workers) as workers:
+        pairs = _play(config, task, scenes, _labels(loaded), workers)
+        telling = most_telling(pairs, config.telling_scenes)
+        cards = _draw(config, [*telling, *(pair for pair in pairs if pair not in telling)], workers)
+    for line in _summary(pairs):
+        logger.info("%s", line)
+    page = config.run_dir / PAGE_NAME
+    content: dict[str, Any] = {
+        "telling": cards[: len(telling)],
+        "others": cards[len(telling) :],
+        "facts": _facts(config, loaded),
+    }
+    page.write_text(make_page(**content, curve=None), encoding="utf-8")
+    if config.docs_dir is not None:
+        write_pictures(config.docs_dir, cards[0], task)
+    if config.train_iterations > 0:
+        curve = figures.curve_figure(*_train_on(config, loaded[0]))
+        page.write_text(make_page(**content, curve=curve), encoding="utf-8")
+    if config.open_browser:
+        webbrowser.open(page.resolve().as_uri())
+    return page
+
+
+def most_telling(pairs: Sequence[_Pair], count: int) -> list[_Pair]:
+    """Return the scenes that show most.
+
+    First come those that end well for one policy and not for the other, whichever it is, then those with the least
+    clearance; in case of doubt the one with the smaller index.
+
+    Args:
+        pairs: The scenes, as both policies played them.
+        count: How many to return at most [1].
+
+    Returns:
+        The scenes, the most telling first.
+    """
+
+    def rank(pair: _Pair) -> tuple[bool, float, int]:
+        is_alike = len({recording.outcome == "success" for recording in pair}) == 1
+        return is_alike, min(recording.min_clearance for recording in pair), pair[0].scene.index
+
+    return sorted(pairs, key=rank)[:count]
+
+
+def write_pictures(folder: Path, card: Card, task: TaskConfig) -> None:
+    """Write the documentation's pictures.
+
+    Args:
+        folder: Folder to write to; made if need be.
+        card: The scene to show.
+        task: The task, whose layout is drawn.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = {
+        "layout.png": figures.layout_figure(task.scenario),
+        "paths.png": card.paths,
+        "snapshots.png": figures.snapshots_figure(card.recordings),
+        "collision_distribution.png": figures.distribution_figure(card.recordings),
+        "demo.webp": card.animation,
+    }
+    for name, content in pictures.items():
+        (folder / name).write_bytes(content)
+
+
+def _load(name: str, config: DemoConfig) -> LoadedPolicy:
+    # Where weights are missing, the one line names the command that makes them.
+    if name in METHODS and name not in shipped_methods():
+        others = " ".join(f"runs/{other}" if other == name else other for other in config.policies)
+        msg = (
+            f"no weights of method {name!r} are shipped with this copy; accepted: first "
+            f"`cura-torchrl train --method {name} --run-dir runs/{name}`, then `cura-torchrl demo --policies {others}`"
+        )
+        raise UnavailableError(msg)
+    loaded = load_policy(name)
+    if loaded.config.perception == "map":
+        load_encoder(loaded.config.encoder)
+    return loaded
+
+
+def _labels(loaded: Sequence[LoadedPolicy]) -> list[str]:
+    labels = [METHODS[policy.config.method].label for policy in loaded]
+    if len(set(labels)) == len(labels):
+        return labels
+    return [f"{label} ({policy.record['frames']:,} steps)" for label, policy in zip(labels, loaded, strict=True)]
+
+
+def _task(config: DemoConfig, loaded: LoadedPolicy) -> TaskConfig:
+    task = loaded.config.env.task
+    scenario = dataclasses.replace(
+        task.scenario, kind="mixed", object_edges=config.object_sizes, max_obstacles=config.max_obstacles
+    )
+    # Pictures show the true obstacles; the policies read only what they did in training.
+    return dataclasses.replace(task, scenario=scenario, privileged=True)
+
+
+def _scenes(config: DemoConfig, task: TaskConfig) -> list[Scene]:
+    try:
+        return choose_scenes(task.scenario, seed=config.seed, count=config.scenes)
+    except ValueError as error:
+        raise RunError(str(error)) from None
+
+
+@contextmanager
+def _workers(count: int) -> Iterator[Executor]:
+    if count == 1:
+        yield _Here()
+        return
+    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+class _Here(Executor):
+    """Does the work at once, in this process."""
+
+    def submit(self, fn: Callable[..., _T], /, *args: Any, **kwargs: Any) -> Future[_T]:
+        future: Future[_T] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+def _play(
+    config: DemoConfig, task: TaskConfig, scenes: list[Scene], labels: Sequence[str], workers: Executor
+) -> list[_Pair]:
+    """Return every scene as both policies play it."""
+    total = _num_states(task) * len(labels)
+    with tqdm(total=total, desc="play", unit="step", file=sys.stderr) as bar, contextlib.ExitStack() as stack:
+        if isinstance(workers, _Here):
+            report, inbox = bar.update, None
+        else:
+            manager = stack.enter_context(multiprocessing.get_context("spawn").Manager())
+            inbox = manager.Queue()
+            report = inbox.put
+        futures = [
+            workers.submit(_play_one, config, name, task, scenes, label, report)
+            for name, label in zip(config.policies, labels, strict=True)
+        ]
+        while inbox is not None and not all(future.done() for future in futures):
+            with contextlib.suppress(queue.Empty):
+                bar.update(inbox.get(timeout=0.2))
+        played = [future.result() for future in futures]
+        bar.update(bar.total - bar.n)
+    return list(zip(*played, strict=True))
+
+
+def _play_one(
+    config: DemoConfig, name: str, task: TaskConfig, scenes: list[Scene], label: str, report: Callable[[int], object]
+) -> list[Recording]:
+    """Return the recordings of one policy; the scenes run side by side."""
+    if config.num_workers > 1:
+        torch.set_num_threads(1)
+    loaded = load_policy(name)
+    with closing(loaded.make_env(len(scenes), task=task, keep_map=True, seed=config.seed)) as env:
+        return record(
+            env,
+            loaded.policy,
+            loaded.collision_estimator,
+            scenes,
+            label=label,
+            stride=config.frame_stride,
+            watch=lambda _: report(1),
+        )
+
+
+def _num_states(task: TaskConfig) -> int:
+    # Of an episode that lasts until the time limit.
+    return round(task.episode_time / task.policy_period) + 1
+
+
+def _draw(config: DemoConfig, pairs: Sequence[_Pair], workers: Executor) -> list[Card]:
+    every = itertools.chain(itertools.repeat(1, config.telling_scenes), itertools.repeat(2))
+    futures = [workers.submit(draw_card, pair, every=step) for pair, step in zip(pairs, every, strict=False)]
+    with tqdm(total=len(futures), desc="draw", unit="scene", file=sys.stderr) as bar:
+        cards = []
+        for future in futures:
+            cards.append(future.result())
+            bar.update()
+    return cards
+
+
+def draw_card(pair: _Pair, *, every: int) -> Card:
+    """Draw a scene.
+
+    Args:
+        pair: The scene as both policies played it.
+        every: Every how many recorded frames are shown [1].
+
+    Returns:
+        The scene with its pictures.
+    """
+    frames = render.animation_frames(pair, every=every)
+    return Card(
+        recordings=pair,
+        paths=figures.paths_figure(pair),
+        animation=render.encode_animation(frames, frame_time=every * _FRAME_TIME),
+    )
+
+
+def _summary(pairs: Sequence[_Pair]) -> Iterator[str]:
+    """Yield one line per policy and scenario."""
+    for kind in ("adversarial", "uniform"):
+        for recordings in zip(*(pair for pair in pairs if pair[0].scene.kind == kind), strict=True):
+            counts = summarise([recording.episode for recording in recordings])
+            rate, low, high = (counts[name] for name in ("success_rate", "wilson_low", "wilson_high"))
+            yield (
+                f"{kind:<12}{recordings[0].label:<20}{counts['successes']} of {counts['episodes']} reached the goal "
+                f"({rate:.0%}, 95 % interval {low:.0%} to {high:.0%}); "
+                f"collisions {counts['collisions']}, time-outs {counts['timeouts']}"
+            )
+
+
+def _facts(config: DemoConfig, loaded: Sequence[LoadedPolicy]) -> dict[str, str]:
+    machine = hardware()
+    facts = {}
+    for label, policy in zip(_labels(loaded), loaded, strict=True):
+        frames, seed, commit = (policy.record[name] for name in ("frames", "seed", "commit"))
+        facts[label] = f"{frames:,} environment steps of training, seed {seed}, commit {commit}"
+    facts["Scenes"] = f"evaluation stream, seed {config.seed}, up to {config.max_obstacles} obstacles, at least one"
+    facts["Commit"] = git_commit()
+    facts["Machine"] = f"{machine['platform']}, {machine['cores']} cores, {machine['memory_gib']} GiB"
+    facts["Versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
+    return facts
+
+
+def _train_on(config: DemoConfig, loaded: LoadedPolicy) -> tuple[list[dict[str, float]], list[dict[str, float]]]:
+    # Rows of the run that the networks come from, and those that are added here.
+    before = read_progress(progress_path(loaded.path))
+    folder = config.run_dir / TRAINING_FOLDER
+    if (folder / CHECKPOINT_FOLDER).is_dir():
+        shutil.rmtree(folder)
+    logger.info("training goes on for %d iterations", config.train_iterations)
+    train(_continued(config, loaded, before, folder), init_from=loaded.path)
+    return before, read_progress(folder / PROGRESS_NAME)
+
+
+def _continued(
+    config: DemoConfig, loaded: LoadedPolicy, before: Sequence[dict[str, float]], folder: Path
+) -> TrainConfig:
+    """Return the run's own configuration as it was in the end, on fewer worlds."""
+    run = loaded.config
+    most = most_obstacles(run.env.task, loaded.record["frames"])
+    scenario = dataclasses.replace(run.env.task.scenario, max_obstacles=most)
+    task = dataclasses.replace(run.env.task, scenario=scenario, curriculum=(), random_first_age=True)
+    last = before[-1].get("lr", math.nan) if before else math.nan
+    rate = last if math.isfinite(last) else min(run.ppo.lr, _FIRST_RATE)
+    return run.replace(
+        run_dir=folder,
+        num_envs=config.train_envs,
+        num_workers=1,
+        total_frames=config.train_iterations * config.train_envs * run.ppo.rollout_steps,
+        device="cpu",
+        logger="csv",
+        checkpoint_minutes=60.0,
+        env=dataclasses.replace(run.env, task=task),
+        ppo=dataclasses.replace(run.ppo, lr=min(max(rate, run.ppo.min_lr), run.ppo.max_lr), critic_warmup_frames=0),
+        cura=dataclasses.replace(run.cura, costs_start_frames=0),
+    )
+
+
+def progress_path(checkpoint: Path) -> Path:
+    """Return where the progress of the run lies that a checkpoint is of.
+
+    Args:
+        checkpoint: Folder of a checkpoint of a run, or of shipped weights.
+
+    Returns:
+        File of the run's folder, or, for shipped weights, the file beside their folder; it need not exist.
+
+    Examples:
+        >>> progress_path(Path("runs/a/checkpoints/checkpoint-1")).as_posix()
+        'runs/a/progress.csv'
+        >>> progress_path(Path("weights/push")).as_posix()
+        'weights/push-progress.csv'
+    """
+    if checkpoint.parent.name == CHECKPOINT_FOLDER:
+        return checkpoint.parents[1] / PROGRESS_NAME
+    return checkpoint.with_name(f"{checkpoint.name}-{PROGRESS_NAME}")

@@ -1,0 +1,156 @@
+"""The command line as a user meets it: in a process of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
+from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
+from cura_torchrl.trainers.demo_config import DemoConfig
+from cura_torchrl.trainers.methods import METHODS, method
+from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+COMMAND = [sys.executable, "-m", "cura_torchrl.trainers.cli"]
+SMALL = [
+    "--method", "push", "--perception", "none", "--num-envs", "2", "--ppo.rollout-steps", "4",
+    "--checkpoint-minutes", "0", "--learner-threads", "1", "--network.actor-hidden-sizes", "8", "--network.critic-hidden-sizes", "8",
+    "--network.collision-hidden-sizes", "8",
+]  # fmt: skip
+FRAMES = 8
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line to its end."""
+    environment = {**os.environ, "COLUMNS": "200"}
+    return subprocess.run(
+        [*COMMAND, *arguments], capture_output=True, text=True, timeout=240, env=environment, check=False
+    )
+
+
+def flags(config: type[object], prefix: str = "") -> list[str]:
+    """All flags that a configuration's fields make, nested ones with a dot."""
+    found = []
+    for field in dataclasses.fields(config):
+        name = prefix + field.name.replace("_", "-")
+        nested = field.default_factory if dataclasses.is_dataclass(field.default_factory) else None
+        found += flags(nested, f"{name}.") if nested else [f"--{name}"]
+    return found
+
+
+def test_help_lists_every_command_and_method() -> None:
+    """Catches a command that nobody finds."""
+    done = run("--help")
+    assert done.returncode == 0
+    for name in ("pretrain-map", "train", "evaluate", "demo", "info", *METHODS):
+        assert name in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("command", "config"), [("train", TrainConfig), ("evaluate", EvaluateConfig), ("demo", DemoConfig)]
+)
+def test_help_lists_every_field(command: str, config: type[object]) -> None:
+    """Catches a setting that can only be changed in the code, and help that has to import torch."""
+    done = run(command, "--help")
+    assert done.returncode == 0
+    words = done.stdout.replace("│", " ").replace(",", " ").split()
+    assert [flag for flag in flags(config) if flag not in words] == []
+
+
+def test_help_of_a_method_shows_its_own_defaults() -> None:
+    """Catches flags that show cura-ppo's coefficients whatever the method is."""
+    shown = run("train", "--method", "push", "--help").stdout
+    assert "lambda_u" in shown
+    line = shown[shown.index("--cura.uncertainty-coeff") :]
+    assert "(default: 0.0)" in " ".join(line.replace("│", " ").split())[:300]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["trian"], "'trian' is no command; accepted: pretrain-map, "),
+        (["train", "--method", "cura"], "method is 'cura' (did you mean cura-ppo?); accepted: cura-ppo, push"),
+        (["train", "--num-evns", "3"], "Unrecognized options: --num-evns"),
+        (["train", "--num-envs", "many"], "--num-envs"),
+        (["train", "--ppo.lr", "nan"], "lr is nan; accepted: finite numbers"),
+        (["train", "--env.task.episode-time", "nan"], "episode_time is nan; accepted: finite numbers"),
+        (["train", "--simulator", "isaac"], "--simulator"),
+        (["train", "--resume", "--run-dir", "{tmp}"], "no checkpoint at"),
+        (["train", "--logger", "carrier-pigeon"], "--logger"),
+        (["train", "--encoder", "{tmp}/none.pt", "--run-dir", "{tmp}/run"], "cura-torchrl pretrain-map"),
+        (["evaluate"], "accepted: one of checkpoint, method, policy"),
+        (["evaluate", "--checkpoint", "{tmp}"], "no checkpoint at"),
+        (["evaluate", "--checkpoint", "{tmp}/none"], "no checkpoint at"),
+        (
+            ["evaluate", "--method", "cura"],
+            "method is 'cura' (did you mean cura-ppo?)",
+        ),
+        (["evaluate", "--policy", "scripted", "--object-size", "nan"], "object_size is nan; accepted: finite numbers"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
+    """Catches a traceback, or an exit code of 0, for what the user can mend."""
+    done = run(*(argument.format(tmp=tmp_path) for argument in arguments))
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    told = [line for line in done.stderr.splitlines() if line.startswith("cura-torchrl: ")]
+    assert len(told) == 1
+    assert done.stdout == ""
+
+
+def test_a_damaged_checkpoint_is_refused_in_one_line(tmp_path: Path) -> None:
+    """Catches an evaluation of weights that are not those that were trained."""
+    path = save_checkpoint({}, method("push"), tmp_path / CHECKPOINT_FOLDER, frames=3)
+    (path / "config.json").write_text("{}", encoding="utf-8")
+    done = run("evaluate", "--checkpoint", str(tmp_path))
+    assert done.returncode == 2
+    assert "is damaged: config.json has changed" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_info_is_json() -> None:
+    """Catches a report of a bug that does not say what was run."""
+    found = json.loads(run("info", "--json").stdout)
+    assert {"versions", "commit", "hardware", "works", "shipped methods"} == set(found)
+
+
+def test_evaluation_prints_nothing_but_json() -> None:
+    """Catches the simulator's greeting on stdout, which no JSON reader accepts."""
+    flags_ = ["--policy", "random", "--scenario", "adversarial", "--object-size", "1.0", "--max-obstacles", "0"]
+    done = run("evaluate", *flags_, "--episodes", "2", "--chunk", "2", "--seed", "3", "--simulator", "bullet", "--json")
+    result = json.loads(done.stdout)
+    assert (result["episodes"], result["scenario"], result["object_size"], result["seed"]) == (2, "adversarial", 1.0, 3)
+
+
+def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
+    """Catches a checkpoint that SIGKILL leaves half written, and a resumed run that starts over."""
+    folder = tmp_path / "run"
+    arguments = ["train", *SMALL, "--run-dir", str(folder)]
+    with subprocess.Popen(
+        [*COMMAND, *arguments, "--total-frames", "1000000"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
+        deadline = time.monotonic() + 180
+        while len(read_progress(folder / PROGRESS_NAME)) < 4 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGKILL)
+    last = max(int(entry.name.split("-")[1]) for entry in (folder / CHECKPOINT_FOLDER).glob("checkpoint-*"))
+    assert last >= 3 * FRAMES
+    done = run(*arguments, "--total-frames", str(last + 2 * FRAMES), "--resume")
+    assert done.returncode == 0, done.stderr
+    frames = [row["frames"] for row in read_progress(folder / PROGRESS_NAME)]
+    assert frames == [FRAMES * (index + 1) for index in range(len(frames))]
+    assert frames[-1] == last + 2 * FRAMES
+    assert not list((folder / CHECKPOINT_FOLDER).glob(".stage-*"))
+    assert done.stdout.strip().endswith(f"checkpoint-{last + 2 * FRAMES:012d}")

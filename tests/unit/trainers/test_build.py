@@ -1,0 +1,87 @@
+"""What configurations are turned into."""
+
+from __future__ import annotations
+
+import functools
+import pickle
+from typing import TYPE_CHECKING
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from cura_torchrl.trainers import build as module
+from cura_torchrl.trainers.build import LATENT_SIZE, Networks, load_encoder, make_env, make_worker_env
+from cura_torchrl.trainers.errors import UnavailableError
+from cura_torchrl.trainers.methods import method
+from cura_torchrl.trainers.privileged import ObstacleCode
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_workers_play_every_scenario_once_and_none_again_after_a_resume() -> None:
+    """Catches workers that all play the same scenes, and a resumed run that starts over with old ones."""
+    config = method("push").replace(num_envs=4, num_workers=2, perception="none")
+    played = []
+    for frames_done in (0, 1000):
+        for worker in range(2):
+            env = make_worker_env(config.replace(num_workers=1), 2, worker=worker, frames_done=frames_done)
+            played += env.reset()["episode"].flatten().tolist()
+            env.close()
+    assert played == [0, 1, 2, 3, 1000, 1001, 1002, 1003]
+
+
+def test_the_factory_of_a_worker_s_environment_can_be_sent_to_it() -> None:
+    """Catches a closure or a live simulator in what is pickled for a worker."""
+    factory = functools.partial(make_worker_env, method("cura-ppo"), 2, worker=0, frames_done=0)
+    assert pickle.loads(pickle.dumps(factory)).args[0] == method("cura-ppo")
+
+
+def test_networks_share_one_normalisation() -> None:
+    """Catches statistics of which each network has its own, two of them never updated."""
+    networks = Networks(method("push"))
+    for network in (networks.actor, networks.critic, networks.collision_estimator):
+        assert any(part is networks.observation_norm for part in network.modules())
+
+
+@pytest.mark.parametrize("content", [None, b"", b"not weights"])
+def test_encoder_weights_that_are_missing_or_damaged_are_told_in_one_line(
+    tmp_path: Path, content: bytes | None
+) -> None:
+    """Catches a traceback from torch's loader, or a hint that does not name the command that helps."""
+    path = tmp_path / "map_vae.pt"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UnavailableError, match="cura-torchrl pretrain-map") as caught:
+        load_encoder(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_shipped_encoder_is_looked_for_in_the_package() -> None:
+    """Catches a path that holds only where the package was developed."""
+    assert module.SHIPPED_ENCODER.parent.parent.name == "modules"
+
+
+def test_without_perception_the_code_is_zero() -> None:
+    """Catches obstacle-free pretraining whose networks do not fit the map's code later."""
+    env = make_env(method("push").replace(perception="none"), 2)
+    try:
+        batch = env.rollout(2)
+    finally:
+        env.close()
+    assert batch["next", "latent"].shape == (2, 2, LATENT_SIZE)
+    assert not batch["next", "latent"].any()
+
+
+def test_privileged_code_tells_the_obstacles_in_the_base_frame() -> None:
+    """Catches obstacles in the world frame, which would be of no use to a policy in the base frame."""
+    transform = ObstacleCode(LATENT_SIZE, is_blind=False)
+    obstacles = torch.zeros(1, 6, 4)
+    obstacles[0, 2] = torch.tensor([1.0, 4.0, 0.3, 0.6])
+    # The base is at (1, 2) and looks along world y: the obstacle is 2 m ahead of it.
+    pose = torch.tensor([[1.0, 2.0, torch.pi / 2]])
+    code = transform(TensorDict({"sensor_pose": pose, "obstacles": obstacles}, [1]))["latent"]
+    torch.testing.assert_close(code[0, 8:12], torch.tensor([0.2, 0.0, 0.6, 1.0]))
+    assert code[0, :8].abs().sum() == 0
+    assert code[0, 12:].abs().sum() == 0

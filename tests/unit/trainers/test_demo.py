@@ -1,0 +1,166 @@
+"""The demo from end to end, with untrained networks and episodes of a second."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import logging
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from cura_torchrl.modules import MapVAE
+from cura_torchrl.trainers.build import Networks
+from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint, read_config, save_checkpoint
+from cura_torchrl.trainers.config import NetworkConfig
+from cura_torchrl.trainers.demo import PAGE_NAME, TRAINING_FOLDER, DemoConfig, demo, most_telling, progress_path
+from cura_torchrl.trainers.errors import RunError
+from cura_torchrl.trainers.info import shipped_methods
+from cura_torchrl.trainers.methods import METHODS, method
+from cura_torchrl.trainers.progress import read_progress
+from tests.recordings import make_recording
+
+FRAMES = 3000
+"""Steps that the tiny runs claim to have been trained for."""
+
+
+def tiny_run(name: str, folder: Path) -> Path:
+    """Write a run of untrained networks with short episodes, and return its folder."""
+    encoder = folder / "map_vae.pt"
+    torch.manual_seed(1)
+    MapVAE().save(encoder)
+    preset = method(name)
+    task = dataclasses.replace(preset.env.task, episode_time=1.0, curriculum=((0, 0), (2000, 1), (9000, 6)))
+    small = NetworkConfig(actor_hidden_sizes=(8,), critic_hidden_sizes=(8,), collision_hidden_sizes=(8,))
+    config = preset.replace(
+        run_dir=folder / name,
+        encoder=encoder,
+        env=dataclasses.replace(preset.env, task=task),
+        ppo=dataclasses.replace(preset.ppo, rollout_steps=4, epochs=1, lr=1e-3),
+        network=small,
+    )
+    save_checkpoint({"networks": Networks(config)}, config, config.run_dir / CHECKPOINT_FOLDER, frames=FRAMES)
+    (config.run_dir / "progress.csv").write_text("frames,reward,lr\n2000,1.0,0.002\n3000,1.5,0.003\n")
+    return config.run_dir
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    """Two tiny runs."""
+    folder = tmp_path_factory.mktemp("runs")
+    return str(tiny_run("cura-ppo", folder)), str(tiny_run("push", folder))
+
+
+def tiny_demo(runs: tuple[str, str], folder: Path, **changes: object) -> DemoConfig:
+    """Return the smallest demo: one scene of each kind, one update, all in this process."""
+    options = {"scenes": 1, "telling_scenes": 1, "train_iterations": 1, "train_envs": 2, "num_workers": 1}
+    return DemoConfig(run_dir=folder, policies=runs, **{**options, **changes})
+
+
+def test_demo_plays_writes_its_page_and_trains_on(
+    runs: tuple[str, str], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Catches a step that is left out, training from nothing, and a second demo that trips over the first."""
+    with caplog.at_level(logging.INFO, logger="cura_torchrl"):
+        page = demo(tiny_demo(runs, tmp_path / "demo", docs_dir=tmp_path / "docs"))
+    assert page == tmp_path / "demo" / PAGE_NAME
+    text = page.read_text(encoding="utf-8")
+    assert text.count("<article id=") == 2
+    assert "Learning goes on" in text
+    assert len(text) < 15e6
+    assert "adversarial CURA-PPO            0 of 1 reached the goal (0%, 95 % interval 0% to 79%)" in caplog.text
+    assert "uniform     Push w/ Occlusion   0 of 1 reached the goal" in caplog.text
+    trained = find_checkpoint(tmp_path / "demo" / TRAINING_FOLDER)
+    config, record = read_config(trained)
+    assert record["frames"] == 8  # one rollout of 2 worlds by 4 steps
+    # What the run was in the end: K = 1 of its curriculum, its last learning rate, and costs that are on at once.
+    assert config.env.task.scenario.max_obstacles == 1
+    assert config.env.task.curriculum == ()
+    assert (config.ppo.lr, config.cura.costs_start_frames) == (0.003, 0)
+    assert config.method == "cura-ppo"
+    assert [row["frames"] for row in read_progress(tmp_path / "demo" / TRAINING_FOLDER / "progress.csv")] == [8]
+    names = {"collision_distribution.png", "demo.webp", "layout.png", "paths.png", "snapshots.png"}
+    assert {entry.name for entry in (tmp_path / "docs").iterdir()} == names
+    for name in names:
+        with Image.open(io.BytesIO((tmp_path / "docs" / name).read_bytes())) as image:
+            image.load()
+    again = demo(tiny_demo(runs, tmp_path / "demo", scenes=1, telling_scenes=0))
+    assert "The most telling scenes" not in again.read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_several_processes_play_the_same(runs: tuple[str, str], tmp_path: Path) -> None:
+    """Catches scenes, labels or drawings that get mixed up between processes."""
+    options = {"train_iterations": 0, "scenes": 2}
+    alone = demo(tiny_demo(runs, tmp_path / "one", **options)).read_text(encoding="utf-8")
+    together = demo(tiny_demo(runs, tmp_path / "two", **options, num_workers=2)).read_text(encoding="utf-8")
+    assert alone == together
+
+
+def test_missing_weights_name_the_command_that_makes_them(tmp_path: Path) -> None:
+    """Catches a traceback, or an error after minutes, on a copy without weights."""
+    missing = [name for name in METHODS if name not in shipped_methods()]
+    if not missing:
+        pytest.skip("all weights are shipped")
+    with pytest.raises(RunError) as caught:
+        demo(DemoConfig(run_dir=tmp_path, policies=(missing[0], "push")))
+    message = str(caught.value)
+    assert f"cura-torchrl train --method {missing[0]} --run-dir runs/{missing[0]}" in message
+    assert f"cura-torchrl demo --policies runs/{missing[0]} push" in message
+    assert "\n" not in message
+
+
+def test_a_run_that_is_not_there_is_told_in_one_line(tmp_path: Path) -> None:
+    """Catches an error that does not say which path was wrong."""
+    with pytest.raises(RunError, match=r"no checkpoint at .*nowhere") as caught:
+        demo(DemoConfig(run_dir=tmp_path, policies=(str(tmp_path / "nowhere"), "push")))
+    assert "\n" not in str(caught.value)
+
+
+def test_too_many_scenes_are_refused_before_anything_is_played(runs: tuple[str, str], tmp_path: Path) -> None:
+    """Catches a traceback for a number that is only too large."""
+    with pytest.raises(RunError, match="number of scenes is 300; accepted"):
+        demo(tiny_demo(runs, tmp_path, scenes=300))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"scenes": 0}, "scenes is 0; accepted: 1 or more"),
+        ({"train_iterations": -1}, "train_iterations is -1; accepted: 0 or more"),
+        ({"max_obstacles": 0}, "max_obstacles is 0; accepted: 1 to 6"),
+        ({"object_sizes": (0.5, float("nan"))}, "accepted: finite numbers"),
+        ({"object_sizes": ()}, "one or more of 0.3 to 1.2 m"),
+    ],
+)
+def test_configuration_refuses_what_makes_no_demo(changes: dict[str, object], words: str) -> None:
+    """Catches a demo that fails minutes later."""
+    with pytest.raises(ValueError, match=words):
+        DemoConfig(**changes)
+
+
+def test_telling_scenes_differ_in_outcome_then_are_close_calls() -> None:
+    """Catches a rule that prefers one policy: scene 3 is won by the second one, and counts as much as scene 2."""
+    near = make_recording().obstacles.copy()
+    near[..., 0] -= 2.0
+
+    def pair(index: int, first: str, second: str, **changes: object) -> tuple:
+        return make_recording(index=index, outcome=first, **changes), make_recording(index=index, outcome=second)
+
+    pairs = [
+        pair(1, "success", "success"),
+        pair(2, "success", "collision"),
+        pair(3, "time-out", "success"),
+        pair(4, "collision", "time-out", obstacles=near),
+        pair(5, "success", "success", obstacles=near),
+    ]
+    assert [found[0].scene.index for found in most_telling(pairs, 5)] == [2, 3, 4, 5, 1]
+    assert [found[0].scene.index for found in most_telling(pairs[::-1], 2)] == [2, 3]
+
+
+def test_progress_lies_in_the_run_or_beside_shipped_weights() -> None:
+    """Catches a curve looked for inside of a checkpoint, whose files are all hashed."""
+    assert progress_path(Path("a/checkpoints/checkpoint-12")) == Path("a/progress.csv")
+    assert progress_path(Path("weights/cura-ppo")) == Path("weights/cura-ppo-progress.csv")

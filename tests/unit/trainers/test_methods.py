@@ -1,0 +1,62 @@
+"""Each method is the paper's."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from cura_torchrl.trainers.methods import METHODS, method
+
+# Paper, Sec. V: (object hides what is behind it, alpha, lambda_r, lambda_u); alpha = 1 is a map without confidence.
+PAPER = {
+    "push-no-occlusion": (False, 1.0, 0.0, 0.0),
+    "push": (True, 1.0, 0.0, 0.0),
+    "cura-ppo": (True, 0.9, 0.25, 1.0),
+    "push-conf": (True, 0.9, 0.0, 0.0),
+    "cura-no-uncertainty": (True, 0.9, 0.25, 0.0),
+    "cura-no-risk": (True, 0.9, 0.0, 1.0),
+}
+
+
+@pytest.mark.parametrize(("name", "row"), PAPER.items())
+def test_a_preset_has_the_paper_s_occlusion_decay_and_coefficients(
+    name: str, row: tuple[bool, float, float, float]
+) -> None:
+    """Catches a method that is compared under another's settings."""
+    config = method(name)
+    assert (
+        config.env.lidar.occlusion,
+        config.map.decay,
+        config.cura.risk_coeff,
+        config.cura.uncertainty_coeff,
+    ) == row
+    assert config.method == name
+
+
+def test_methods_differ_in_nothing_else() -> None:
+    """Catches a comparison of methods that also compares learning rates, curricula or networks."""
+
+    def common(name: str) -> object:
+        config = method(name)
+        return config.replace(
+            method="",
+            env=dataclasses.replace(config.env, lidar=dataclasses.replace(config.env.lidar, occlusion=True)),
+            map=dataclasses.replace(config.map, decay=1.0),
+            cura=dataclasses.replace(config.cura, risk_coeff=0.0, uncertainty_coeff=0.0),
+        )
+
+    assert len({common(name) for name in METHODS}) == 1
+
+
+def test_all_listed_methods_are_the_paper_s() -> None:
+    """Catches a method that is offered but not checked here."""
+    assert set(METHODS) == set(PAPER)
+
+
+def test_an_unknown_name_is_refused_with_the_names_there_are() -> None:
+    """Catches a typing error that trains something else."""
+    with pytest.raises(
+        ValueError, match=r"method is 'cura_ppo' \(did you mean cura-ppo\?\); accepted: cura-ppo, push, "
+    ):
+        method("cura_ppo")

@@ -1,0 +1,184 @@
+"""The loop, on the real environment with two worlds."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+from typing import TYPE_CHECKING
+
+import pytest
+import torch
+
+from cura_torchrl.envs.config import TaskConfig
+from cura_torchrl.trainers import train as module
+from cura_torchrl.trainers.build import Networks, build_collector
+from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint, read_config
+from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NonFiniteError, WorkerError
+from cura_torchrl.trainers.learner import Learner
+from cura_torchrl.trainers.methods import method
+from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
+from cura_torchrl.trainers.train import most_obstacles, train
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from cura_torchrl.trainers.config import TrainConfig
+
+FRAMES = 8
+"""Frames of one rollout: two worlds, four steps."""
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> TrainConfig:
+    """A run of two updates that sees no map."""
+    preset = method("cura-ppo")
+    sizes = {"actor_hidden_sizes": (8,), "critic_hidden_sizes": (8,), "collision_hidden_sizes": (8,)}
+    return preset.replace(
+        num_envs=2,
+        total_frames=2 * FRAMES,
+        perception="none",
+        run_dir=tmp_path / "run",
+        checkpoint_minutes=0.0,
+        learner_threads=1,
+        ppo=dataclasses.replace(preset.ppo, rollout_steps=4),
+        network=dataclasses.replace(preset.network, **sizes),
+    )
+
+
+def frames_of(config: TrainConfig) -> list[float]:
+    """Frames of the rows in progress.csv."""
+    return [row["frames"] for row in read_progress(config.run_dir / PROGRESS_NAME)]
+
+
+def test_a_run_writes_rows_and_checkpoints_and_goes_on_where_it_stopped(config: TrainConfig) -> None:
+    """Catches a resumed run that starts over, repeats rows, or forgets its optimisers."""
+    path = train(config)
+    assert frames_of(config) == [FRAMES, 2 * FRAMES]
+    assert read_config(path)[1]["frames"] == 2 * FRAMES
+    longer = config.replace(total_frames=3 * FRAMES)
+    again = train(longer, resume=True)
+    assert frames_of(config) == [FRAMES, 2 * FRAMES, 3 * FRAMES]
+    assert read_config(again) == (longer, read_config(again)[1])
+    assert find_checkpoint(config.run_dir) == again
+
+
+def test_a_finished_run_is_left_as_it_is(config: TrainConfig) -> None:
+    """Catches a resume that trains beyond the frames that were asked for."""
+    assert train(config) == train(config, resume=True)
+
+
+def test_a_folder_with_a_run_is_not_overwritten(config: TrainConfig) -> None:
+    """Catches days of training lost to a forgotten flag."""
+    train(config)
+    with pytest.raises(CheckpointError, match="holds a run already; accepted: --resume"):
+        train(config)
+    with pytest.raises(CheckpointError, match="method is 'push' but"):
+        train(config.replace(method="push"), resume=True)
+
+
+def test_two_processes_do_not_train_in_one_folder(config: TrainConfig) -> None:
+    """Catches checkpoints of two runs mixed in one folder."""
+    with module._locked(config.run_dir), pytest.raises(CheckpointError, match="is being trained in by another process"):
+        train(config)
+
+
+def test_networks_may_start_from_another_run(config: TrainConfig, tmp_path: Path) -> None:
+    """Catches a warm start that loads optimisers or counters, or nothing at all."""
+    train(config)
+    started = config.replace(run_dir=tmp_path / "second", total_frames=FRAMES)
+    before = module._Run(started, resume=False, init_from=config.run_dir)
+    source = module._Run(config, resume=True, init_from=None)
+    ours, theirs = before.learner.networks.state_dict(), source.learner.networks.state_dict()
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    assert (before.learner.frames, source.learner.frames) == (0, 2 * FRAMES)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_run_with_a_checkpoint(
+    config: TrainConfig, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a run that loses what it has learned since the last checkpoint when it is told to stop."""
+    update = Learner.update
+
+    def update_and_signal(self: Learner, batch: object) -> dict[str, float]:
+        os.kill(os.getpid(), number)  # in the middle of an update, which is finished first
+        return update(self, batch)
+
+    monkeypatch.setattr(Learner, "update", update_and_signal)
+    with pytest.raises(Interrupted) as caught:
+        train(config.replace(checkpoint_minutes=1e6))
+    assert caught.value.exit_code == 128 + number
+    assert read_config(find_checkpoint(config.run_dir))[1]["frames"] == FRAMES
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_a_number_that_is_not_finite_leaves_the_last_checkpoint(
+    config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a run that saves what a NaN has spoilt."""
+    update = Learner.update
+
+    def spoil(self: Learner, batch: object) -> dict[str, float]:
+        if self.frames == FRAMES:
+            batch["next", "reward"][0, 0] = float("nan")
+        return update(self, batch)
+
+    monkeypatch.setattr(Learner, "update", spoil)
+    with pytest.raises(NonFiniteError, match=r"next\.reward of the rollout is not finite at 8 frames"):
+        train(config)
+    path = find_checkpoint(config.run_dir)
+    assert read_config(path)[1]["frames"] == FRAMES
+    assert len(list((config.run_dir / CHECKPOINT_FOLDER).iterdir())) == 2
+
+
+def test_the_curriculum_counts_frames() -> None:
+    """Catches a curriculum that is one step off, or one that plays all obstacles before its first step."""
+    task = TaskConfig(curriculum=((100, 1), (200, 3)))
+    assert [most_obstacles(task, frames) for frames in (0, 99, 100, 199, 200, 10**9)] == [0, 0, 1, 1, 3, 3]
+    assert most_obstacles(TaskConfig(), 0) == 6
+
+
+@pytest.mark.slow
+def test_workers_act_with_the_learner_s_present_weights(config: TrainConfig) -> None:
+    """Catches workers that go on with old weights or normalisation: PPO's ratios would be wrong from the first step."""
+    shared = config.replace(num_workers=2)
+    learner = Learner(shared, Networks(shared))
+    actor = learner.networks.actor
+    with build_collector(shared, actor, frames_done=0) as collector:
+        for _ in range(3):
+            batch = collector.next()
+            assert batch.shape == (2, 4)
+            assert batch["episode"][:, 0].flatten().tolist() == [0, 1]
+            with torch.no_grad():
+                now = actor.module[0](batch.select("observation", "latent"))
+            torch.testing.assert_close(now["loc"], batch["loc"], atol=1e-5, rtol=0)
+            learner.update(batch)
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_is_told_in_one_line(config: TrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a learner that waits for ever for a process that the system has killed."""
+    build = module.build_collector
+
+    class Killer:
+        """Kills a worker before the second rollout."""
+
+        def __init__(self, collector: object) -> None:
+            self.collector, self.count = collector, 0
+
+        def next(self) -> object:
+            self.count += 1
+            if self.count == 2:
+                os.kill(self.collector.procs[0].pid, signal.SIGKILL)
+            return self.collector.next()
+
+    @module.contextmanager
+    def build_and_kill(*given: object, **options: object) -> object:
+        with build(*given, **options) as collector:
+            yield Killer(collector)
+
+    monkeypatch.setattr(module, "build_collector", build_and_kill)
+    with pytest.raises(WorkerError, match="a process that collects has died"):
+        train(config.replace(num_workers=2))
+    assert read_config(find_checkpoint(config.run_dir))[1]["frames"] == FRAMES

@@ -1,0 +1,127 @@
+"""PyBullet worlds by hand, for tests of the physics: one robot, one box, no task."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from cura_torchrl.envs.config import PhysicsConfig, RobotConfig
+from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots.controller import ImpedanceController
+from cura_torchrl.envs.simulation.bullet import BulletWorlds
+from cura_torchrl.envs.simulation.interface import SceneState
+
+if TYPE_CHECKING:
+    from cura_torchrl.envs.simulation.bullet import TorqueLaw
+    from cura_torchrl.envs.simulation.interface import WorldState
+
+TICKS = 40
+"""Control ticks of 5 ms in a policy step."""
+
+AWAY = (-30.0, 0.0, 0.0)
+"""Where a body is put that a test has no use for."""
+
+
+def make_scene(num_worlds: int = 1, **overrides: Any) -> SceneState:
+    """Return the home posture at the origin and a 5 kg box far away; values may be given per world or for all."""
+    values = {
+        "edge": 0.5,
+        "mass": 5.0,
+        "friction": 0.5,
+        "com": (0.0, 0.0, 0.0),
+        "object": AWAY,
+        "base": (0.0, 0.0, 0.0),
+    }
+    rows = {}
+    for name, value in (values | overrides).items():
+        tensor = torch.as_tensor(value, dtype=torch.float64)
+        shape = tuple(torch.as_tensor(values[name]).shape)
+        rows[name] = tensor.expand(num_worlds, *shape).clone()
+    arm = torch.tensor(model.HOME, dtype=torch.float64).expand(num_worlds, -1)
+    return SceneState(
+        joint_position=torch.cat([rows["base"], arm], -1),
+        object_edge=rows["edge"],
+        object_mass=rows["mass"],
+        floor_friction=rows["friction"],
+        com_offset=rows["com"],
+        object_pose=rows["object"],
+        num_slots=6,
+    )
+
+
+def make_worlds(num_worlds: int = 1, **overrides: Any) -> BulletWorlds:
+    """Return worlds, reset to :func:`make_scene`, with the default physics."""
+    worlds = BulletWorlds(num_worlds, model.URDF, model.BASE_JOINTS + model.ARM_JOINTS, PhysicsConfig())
+    worlds.reset(torch.arange(num_worlds), make_scene(num_worlds, **overrides))
+    return worlds
+
+
+class NoTorque:
+    """A law for robots that are left alone."""
+
+    ik_ticks = TICKS
+
+    def solve_ik(self) -> None:
+        """Plan nothing."""
+
+    def torques(self, rows: slice, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Return zeros."""
+        return np.zeros_like(position)
+
+
+class Recorder:
+    """A law that passes another one on and keeps what it saw and said, tick by tick."""
+
+    def __init__(self, law: TorqueLaw) -> None:
+        self.law, self.ik_ticks = law, law.ik_ticks
+        self.velocity: list[np.ndarray] = []
+        self.torque: list[np.ndarray] = []
+
+    def solve_ik(self) -> None:
+        """Plan."""
+        self.law.solve_ik()
+
+    def torques(self, rows: slice, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Return the law's torques."""
+        torque = self.law.torques(rows, position, velocity)
+        self.velocity.append(velocity.copy())
+        self.torque.append(torque.copy())
+        return torque
+
+
+class Rig:
+    """Robots under impedance control, moved by policy actions. Close it."""
+
+    def __init__(self, num_worlds: int = 1, *, height_limit: float = 0.45, **overrides: Any) -> None:
+        self.rows = num_worlds
+        self.worlds = make_worlds(num_worlds, **overrides)
+        self.controller = ImpedanceController(num_worlds, RobotConfig(), PhysicsConfig(), TICKS)
+        limit = torch.full((num_worlds,), height_limit, dtype=torch.float64)
+        self.controller.reset(torch.arange(num_worlds), limit)
+        self.record = Recorder(self.controller)
+
+    @property
+    def state(self) -> WorldState:
+        """State of the worlds."""
+        return self.worlds.state()
+
+    def move(self, *action: float, steps: int = 1, ticks: int = TICKS) -> None:
+        """Play one action in every world."""
+        self.play(torch.tensor(action).expand(steps, self.rows, 6), ticks)
+
+    def play(self, actions: torch.Tensor, ticks: int = TICKS) -> None:
+        """Play actions, shape ``[T, N, 6]``; the hand points ahead."""
+        ahead = torch.tensor([[5.0, 0.0]], dtype=torch.float64).expand(self.rows, 2)
+        for action in actions:
+            self.controller.command(action, ahead, self.worlds.mass_matrix())
+            self.worlds.advance(self.record, ticks)
+
+    def tcp(self) -> np.ndarray:
+        """Return the TCP in the base frame [m], shape ``[N, 3]``."""
+        return self.controller.kinematics.forward(self.state.joint_position)[0].numpy()
+
+    def close(self) -> None:
+        """Disconnect."""
+        self.worlds.close()
