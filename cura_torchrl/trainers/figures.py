@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from cura_torchrl.trainers.recording import Recording
 
 _WORLD_X, _WORLD_Y = (-2.5, 16.0), (-4.625, 4.625)
+_MAP_TICKS = (-4, -2, 0, 2, 4)
 _DOTS = 140
 """Resolution of the pictures [pixel/inch]."""
 _POSE_TIME = 5.0
@@ -50,12 +51,13 @@ def paths_figure(recordings: Sequence[Recording]) -> bytes:
     Returns:
         Content of a PNG file.
     """
-    figure = Figure(figsize=(5.0 * len(recordings), 2.9), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(1, len(recordings), sharex=True, sharey=True))
+    figure = Figure(figsize=(5.0 * len(recordings), 3.1))
+    axes = np.atleast_1d(figure.subplots(1, len(recordings), sharex=True, sharey=True, gridspec_kw={"wspace": 0.06}))
     for axis, recording in zip(axes, recordings, strict=True):
         _draw_paths(axis, recording)
         axis.set_title(f"{recording.label}: {recording.describe()}", fontsize=10, loc="left")
     axes[0].set_ylabel("y [m]")
+    _set_margins(figure)
     return _png(figure)
 
 
@@ -68,11 +70,11 @@ def snapshots_figure(recordings: Sequence[Recording]) -> bytes:
     Returns:
         Content of a PNG file.
     """
-    figure = Figure(figsize=(5.0 * len(recordings), 7.1), layout="constrained")
-    grids = figure.subfigures(1, len(recordings), squeeze=False)[0]
-    for grid, recording in zip(grids, recordings, strict=True):
-        top, confidence, occupancy = grid.subfigures(3, 1, height_ratios=(2.7, 2.0, 2.0))
-        axis = top.subplots()
+    figure = Figure(figsize=(5.0 * len(recordings), 7.2))
+    _set_margins(figure)
+    for cell, recording in zip(figure.add_gridspec(1, len(recordings), wspace=0.15), recordings, strict=True):
+        grid = cell.subgridspec(3, 3, height_ratios=(2.3, 1.5, 1.5), hspace=0.5, wspace=0.1)
+        axis = figure.add_subplot(grid[0, :])
         _draw_paths(axis, recording)
         axis.set_ylabel("y [m]")
         axis.set_title(f"{recording.label}: {recording.describe()}", fontsize=10, loc="left")
@@ -80,8 +82,9 @@ def snapshots_figure(recordings: Sequence[Recording]) -> bytes:
         for name, frame in zip("abc", frames, strict=True):
             place = recording.base_pose[recording.frame_steps[frame], :2]
             _write(axis, name, place, up=12, fontsize=10, fontweight="bold")
-        _draw_maps(confidence, recording, frames, channel=0)
-        _draw_maps(occupancy, recording, frames, channel=-1)
+        for row, channel in ((1, 0), (2, -1)):
+            axes = [figure.add_subplot(grid[row, column]) for column in range(3)]
+            _draw_maps(axes, recording, frames, channel=channel)
     return _png(figure)
 
 
@@ -94,8 +97,9 @@ def distribution_figure(recordings: Sequence[Recording]) -> bytes:
     Returns:
         Content of a PNG file.
     """
-    figure = Figure(figsize=(9.0, 2.5 * len(recordings)), layout="constrained")
-    axes = np.atleast_2d(figure.subplots(len(recordings), 3, sharex=True, sharey=True))
+    figure = Figure(figsize=(9.0, 0.8 + 2.1 * len(recordings)))
+    spaces = {"wspace": 0.06, "hspace": 0.25}
+    axes = np.atleast_2d(figure.subplots(len(recordings), 3, sharex=True, sharey=True, gridspec_kw=spaces))
     bins = np.linspace(0.0, 1.0, 26)
     for row, recording in zip(axes, recordings, strict=True):
         for name, axis, frame in zip("abc", row, telling_frames(recording), strict=True):
@@ -110,6 +114,7 @@ def distribution_figure(recordings: Sequence[Recording]) -> bytes:
         row[0].set_ylabel(f"{recording.label}\nshare of atoms [1]")
     for axis in axes[-1]:
         axis.set_xlabel("collision possibility C [1]")
+    _set_margins(figure, left=0.85)
     return _png(figure)
 
 
@@ -122,7 +127,7 @@ def layout_figure(config: ScenarioConfig) -> bytes:
     Returns:
         Content of a PNG file.
     """
-    figure = Figure(figsize=(8.0, 4.3), layout="constrained")
+    figure = Figure(figsize=(8.0, 4.3))
     axis = figure.subplots()
     for x_range, y_range, colour, text in (
         ((-0.06, 0.06), config.object_y, raster.OBJECT, "object's start"),
@@ -134,11 +139,12 @@ def layout_figure(config: ScenarioConfig) -> bytes:
         _write(axis, text, ((left + right) / 2, high), up=3, fontsize=9)
     (left, right), jitter = config.obstacle_x, config.adversarial_jitter
     strip = np.array([[left, -jitter], [right, -jitter], [right, jitter], [left, jitter]])
-    _outline(axis, strip, raster.INK, linewidth=1.2)
+    _outline(axis, strip, raster.INK, linewidth=1.2, linestyle=":")
     _write(axis, "adversarial: on the line from object to goal", strip[:2].mean(0), up=-12, fontsize=9)
     _draw_sizes(axis, config)
     _frame_world(axis)
     axis.set_ylabel("y [m]")
+    _set_margins(figure, top=0.15)
     return _png(figure)
 
 
@@ -166,8 +172,8 @@ def curve_figure(before: Sequence[dict[str, float]], after: Sequence[dict[str, f
     Returns:
         Content of a PNG file.
     """
-    figure = Figure(figsize=(10.0, 4.8), layout="constrained")
-    grid = figure.subplots(2, 4, width_ratios=(2.6, 1.0, 2.6, 1.0), sharey=False)
+    figure = Figure(figsize=(10.0, 4.8))
+    grid = figure.subplots(2, 4, gridspec_kw={"width_ratios": (2.6, 1.0, 2.6, 1.0), "wspace": 0.22, "hspace": 0.32})
     for pair, (name, label, colour) in zip(grid.reshape(4, 2), _CURVES, strict=True):
         pair[1].sharey(pair[0])
         for axis, rows, unit, style in (
@@ -185,6 +191,7 @@ def curve_figure(before: Sequence[dict[str, float]], after: Sequence[dict[str, f
     for pair in grid[1].reshape(2, 2):
         pair[0].set_xlabel("environment steps [million]")
         pair[1].set_xlabel("steps [thousand]")
+    _set_margins(figure)
     return _png(figure)
 
 
@@ -244,10 +251,9 @@ def _draw_robot(axis: Any, base: Any, tcp: Any) -> None:
     axis.plot([base[0], tcp[0]], [base[1], tcp[1]], color=raster.ARM, linewidth=3.0, solid_capstyle="round")
 
 
-def _draw_maps(figure: Any, recording: Recording, frames: Sequence[int], *, channel: int) -> None:
+def _draw_maps(axes: Sequence[Any], recording: Recording, frames: Sequence[int], *, channel: int) -> None:
     extent = recording.maps.shape[-1] * recording.resolution / 2
     colours = raster.CONFIDENCE_COLOURS if channel == 0 else raster.OCCUPANCY_COLOURS
-    axes = figure.subplots(1, len(frames), sharey=True)
     for name, axis, frame in zip("abc", axes, frames, strict=True):
         axis.imshow(
             recording.maps[frame, channel].T,
@@ -264,7 +270,10 @@ def _draw_maps(figure: Any, recording: Recording, frames: Sequence[int], *, chan
         quantity = "confidence" if channel == 0 else "occupancy"
         axis.set_title(f"{name}: {quantity}, {recording.times[step]:.1f} s", fontsize=8, loc="left")
         axis.tick_params(labelsize=8)
-        axis.set_xlabel("ahead of the base [m]", fontsize=8)
+        axis.set(xticks=_MAP_TICKS, yticks=_MAP_TICKS)
+        axis.tick_params(labelleft=axis is axes[0])
+        if channel != 0:
+            axis.set_xlabel("ahead of the base [m]", fontsize=8)
     axes[0].set_ylabel("left of the base [m]", fontsize=8)
 
 
@@ -290,14 +299,17 @@ def _tidy(axis: Any) -> None:
     axis.tick_params(labelsize=9)
 
 
+def _set_margins(figure: Figure, *, left: float = 0.6, right: float = 0.15, top: float = 0.35) -> None:
+    """Set the margins [inch]; matplotlib's automatic layout takes longer than all the rest of a figure."""
+    width, height = figure.get_size_inches()
+    figure.subplots_adjust(left / width, 0.55 / height, 1 - right / width, 1 - top / height)
+
+
 def _png(figure: Figure) -> bytes:
-    """Return the figure with at most 128 colours, which is a third of the size."""
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        engine.set(w_pad=0.09, h_pad=0.09)
+    # A palette of 256 colours makes a third of the size.
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=_DOTS, facecolor="white")
-    image = Image.open(drawn).convert("RGB").quantize(128, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    image = Image.open(drawn).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     packed = io.BytesIO()
     image.save(packed, "PNG", optimize=True)
     return packed.getvalue()

@@ -40,7 +40,7 @@ METHODS: dict[str, Method] = {
 }
 """The methods by name."""
 
-CURRICULUM = ((0, 0), (50_000, 1), (250_000, 2), (2_000_000, 4), (4_000_000, 6))
+CURRICULUM = ((0, 0), (40_000, 1), (150_000, 2), (2_000_000, 4), (4_000_000, 6))
 """(frames, K): the same schedule for every method, in frames and not by success, which would compare stages of it."""
 
 

@@ -73,11 +73,11 @@ class PretrainMapConfig:
     """Weight of the KL divergence [1]; 1 is the evidence lower bound but for the weight of occupied cells."""
     occupancy_weight: float = 20.0
     """Weight of the occupancy in the cross-entropy beside the confidence [1]; unused where there is only confidence."""
-    occupied_weight: float = 5.0
+    occupied_weight: float = 10.0
     """Weight of an occupied cell beside a free one [1]; a 0.4 m obstacle shows 4 to 8 cells of 10,000."""
     epochs: int = 10
     """Passes over the maps [1]."""
-    batch_size: int = 256
+    batch_size: int = 128
     """Maps per gradient step [1]."""
     lr: float = 2e-3
     """Learning rate at the start; it falls to 0 along half a cosine [1]."""

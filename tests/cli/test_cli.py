@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 COMMAND = [sys.executable, "-m", "cura_torchrl.trainers.cli"]
 SMALL = [
     "--method", "push", "--perception", "none", "--num-envs", "2", "--ppo.rollout-steps", "4",
-    "--checkpoint-minutes", "0", "--learner-threads", "1", "--network.actor-hidden-sizes", "8", "--network.critic-hidden-sizes", "8",
-    "--network.collision-hidden-sizes", "8",
+    "--checkpoint-minutes", "0", "--learner-threads", "1", "--network.actor-hidden-sizes", "8",
+    "--network.critic-hidden-sizes", "8", "--network.collision-hidden-sizes", "8",
 ]  # fmt: skip
 FRAMES = 8
 
@@ -35,7 +35,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run the command line to its end."""
     environment = {**os.environ, "COLUMNS": "200"}
     return subprocess.run(
-        [*COMMAND, *arguments], capture_output=True, text=True, timeout=240, env=environment, check=False
+        [*COMMAND, *arguments], capture_output=True, text=True, timeout=280, env=environment, check=False
     )
 
 

@@ -109,10 +109,10 @@ class EnvContract(ABC):
         assert_same(after["next"][1], expected["next"][1])
         assert (after["next", "elapsed_steps"][0] == torch.arange(1, 5)[:, None]).all()
 
-    @pytest.mark.parametrize("rows", [3, 9])
-    def test_a_row_is_bitwise_what_it_is_alone(self, make: Callable[..., EnvBase], rows: int) -> None:
+    def test_a_row_is_bitwise_what_it_is_alone(self, make: Callable[..., EnvBase]) -> None:
         """Catches a leak between worlds, and arithmetic that rounds differently by the size of the batch."""
-        together, alone = make(rows, limit=LONG + 1), make(1, limit=LONG + 1)
+        # Nine rows: vector instructions and blocks of worlds come in eights, the ninth falls to what is left over.
+        together, alone = make(9, limit=LONG + 1), make(1, limit=LONG + 1)
         actions = draw_actions(together, LONG)
         data = play(together, actions)
         obstructed = together.obstacles[0].any(-1).nonzero().flatten().tolist()

@@ -107,6 +107,8 @@ def test_the_reference_goes_no_further_than_the_torque_reaches():
             controller.torques(slice(0, 1), blocked, np.zeros((1, 10)))
     reach = np.array(model.TORQUE_LIMIT) / np.array(ROBOT.stiffness)  # 0.145 rad for joint 1
     assert (np.abs(controller.reference[0] - model.HOME) <= reach + 1e-12).all()
+    tcp = controller.kinematics.forward(torch.from_numpy(controller.reference))[0].numpy()
+    assert np.abs(controller.tcp_reference - tcp).max() <= ROBOT.tcp_leash + 1e-3
 
 
 @pytest.mark.parametrize("direction", [-1.0, 1.0])
