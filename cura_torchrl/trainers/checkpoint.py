@@ -26,6 +26,7 @@ from cura_torchrl.trainers.config import TrainConfig
 from cura_torchrl.trainers.errors import CheckpointError
 from cura_torchrl.trainers.info import git_commit, shipped_methods, versions
 from cura_torchrl.trainers.methods import METHODS
+from cura_torchrl.trainers.progress import PROGRESS_NAME
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -256,7 +257,7 @@ def load_policy(source: str | Path) -> LoadedPolicy:
 
 
 def export_policy(source: Path, destination: Path | None = None) -> Path:
-    """Write a run's newest networks, without optimisers, in the form in which weights are shipped.
+    """Write a run's newest networks, without optimisers, as weights are shipped, and its curve beside them.
 
     Args:
         source: A run or a checkpoint.
@@ -276,6 +277,9 @@ def export_policy(source: Path, destination: Path | None = None) -> Path:
     # Paths of the machine that trained say nothing elsewhere.
     released = config.replace(run_dir=Path("runs") / config.method, encoder=None)
     folder.parent.mkdir(parents=True, exist_ok=True)
+    curve = path.parents[1] / PROGRESS_NAME
+    if curve.exists():
+        shutil.copyfile(curve, folder.with_name(f"{folder.name}-{PROGRESS_NAME}"))
     return write_checkpoint({"networks": networks}, released, folder, frames=record["frames"])
 
 

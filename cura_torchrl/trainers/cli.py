@@ -55,6 +55,16 @@ class EvaluateOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReleaseOptions:
+    """Write a run's newest networks, without optimisers, as the weights that a method ships with."""
+
+    checkpoint: Path
+    """Run or checkpoint."""
+    destination: Path | None = None
+    """Folder to write; none is the package's own folder for the method."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class InfoOptions:
     """Show versions, hardware, and what works here."""
 
@@ -121,6 +131,13 @@ def _evaluate(arguments: list[str]) -> None:
     with _clean_stdout():
         result = module.evaluate(options.config)
     sys.stdout.write(json.dumps(result, indent=2) + "\n" if options.json else _as_text(result))
+
+
+def _release(arguments: list[str]) -> None:
+    """Write a run's networks as the weights that a method ships with."""
+    options = _parse(ReleaseOptions, "release", arguments)
+    folder = _import("cura_torchrl.trainers.checkpoint").export_policy(options.checkpoint, options.destination)
+    sys.stdout.write(f"{folder}\n")
 
 
 def _info(arguments: list[str]) -> None:
@@ -252,6 +269,7 @@ _COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "imitate": _imitate,
     "train": _train,
     "evaluate": _evaluate,
+    "release": _release,
     "demo": _demo,
     "info": _info,
 }

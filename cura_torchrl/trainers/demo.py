@@ -17,7 +17,6 @@ from contextlib import closing, contextmanager
 from pathlib import Path  # noqa: TC003 - doctest
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import torch
 from tqdm import tqdm
 
 from cura_torchrl.trainers import figures, render
@@ -31,6 +30,7 @@ from cura_torchrl.trainers.methods import METHODS
 from cura_torchrl.trainers.page import Card, make_page
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.recording import Recording, choose_scenes, record
+from cura_torchrl.trainers.threads import one_thread
 from cura_torchrl.trainers.train import most_obstacles, train
 
 if TYPE_CHECKING:
@@ -224,10 +224,8 @@ def _play_one(
     config: DemoConfig, name: str, task: TaskConfig, scenes: list[Scene], label: str, report: Callable[[int], object]
 ) -> list[Recording]:
     """Return the recordings of one policy; the scenes run side by side."""
-    if config.num_workers > 1:
-        torch.set_num_threads(1)
     loaded = load_policy(name)
-    with closing(loaded.make_env(len(scenes), task=task, keep_map=True, seed=config.seed)) as env:
+    with one_thread(), closing(loaded.make_env(len(scenes), task=task, keep_map=True, seed=config.seed)) as env:
         return record(
             env,
             loaded.policy,

@@ -23,6 +23,7 @@ from cura_torchrl.envs.robots import scripted
 from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.info import git_commit, versions
 from cura_torchrl.trainers.statistics import wilson_interval
+from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -198,7 +199,7 @@ def _episode(index: int, last: TensorDictBase, reached: int) -> Episode:
 def _play_all(config: EvaluateConfig) -> Iterator[list[Episode]]:
     chunks = range(-(-config.episodes // config.chunk))
     if config.num_workers == 1:
-        with closing(Player(config)) as player:
+        with one_thread(), closing(Player(config)) as player:
             yield from map(player.play, chunks)
         return
     context = multiprocessing.get_context("spawn")
@@ -207,8 +208,8 @@ def _play_all(config: EvaluateConfig) -> Iterator[list[Episode]]:
 
 
 def _play_in_worker(config: EvaluateConfig, chunk: int) -> list[Episode]:
-    torch.set_num_threads(1)
-    return _worker_player(config).play(chunk)
+    with one_thread():
+        return _worker_player(config).play(chunk)
 
 
 @functools.lru_cache(maxsize=1)

@@ -72,8 +72,9 @@ def snapshots_figure(recordings: Sequence[Recording]) -> bytes:
     """
     figure = Figure(figsize=(5.0 * len(recordings), 7.2))
     _set_margins(figure)
-    for cell, recording in zip(figure.add_gridspec(1, len(recordings), wspace=0.15), recordings, strict=True):
-        grid = cell.subgridspec(3, 3, height_ratios=(2.3, 1.5, 1.5), hspace=0.5, wspace=0.1)
+    cells = figure.add_gridspec(1, len(recordings), wspace=0.15)
+    for index, recording in enumerate(recordings):
+        grid = cells[0, index].subgridspec(3, 3, height_ratios=(2.3, 1.5, 1.5), hspace=0.5, wspace=0.1)
         axis = figure.add_subplot(grid[0, :])
         _draw_paths(axis, recording)
         axis.set_ylabel("y [m]")

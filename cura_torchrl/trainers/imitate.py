@@ -1,8 +1,8 @@
 """A warm start: networks that imitate the scripted pusher where there are no obstacles.
 
-Obstacle-free pushing is what all methods have in common, and on PyBullet it costs PPO millions of frames. Imitation learns it
-from a few ten thousand (dataset aggregation: the learner drives, the expert labels), and ``train --init-from`` goes on from
-there with any method. It sees neither map nor obstacles, so it favours none.
+Obstacle-free pushing is what all methods have in common, and on PyBullet it costs PPO millions of frames. Imitation
+learns it from a few ten thousand (dataset aggregation: the learner drives, the expert labels), and ``train
+--init-from`` goes on from there with any method. It sees neither map nor obstacles, so it favours none.
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ from cura_torchrl.envs.config import require, require_finite
 from cura_torchrl.envs.robots.scripted import ScriptedPusher
 from cura_torchrl.trainers.build import LATENT_SIZE, Networks, make_env
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
-from cura_torchrl.trainers.config import TrainConfig
 from cura_torchrl.trainers.methods import method
+from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
+
+    from cura_torchrl.trainers.config import TrainConfig
 
 logger = logging.getLogger(__name__)
 
@@ -79,7 +81,8 @@ def imitate(config: ImitateConfig) -> Path:
     observations, labels = torch.empty(0), torch.empty(0)
     try:
         for index in range(config.rounds):
-            seen, expert = _collect(env, networks, config, learner_drives=index > 0)
+            with one_thread():
+                seen, expert = _collect(env, networks, config, learner_drives=index > 0)
             observations, labels = torch.cat([observations, seen]), torch.cat([labels, expert])
             networks.observation_norm.update(seen)
             error = _fit(networks, observations, labels, config)
@@ -100,7 +103,12 @@ def _train_config(config: ImitateConfig) -> TrainConfig:
         lidar=dataclasses.replace(preset.env.lidar, num_rays=8),
     )
     return preset.replace(
-        env=env, perception="none", seed=config.seed, run_dir=config.run_dir, num_envs=config.num_envs
+        env=env,
+        network=dataclasses.replace(preset.network, init_std=config.std),
+        perception="none",
+        seed=config.seed,
+        run_dir=config.run_dir,
+        num_envs=config.num_envs,
     )
 
 
@@ -125,7 +133,11 @@ def _collect(
 
 
 def _fit(networks: Networks, observations: torch.Tensor, labels: torch.Tensor, config: ImitateConfig) -> float:
-    """Regress the actor's mean on the labels; return the root mean square error of the last pass."""
+    """Regress the actor's mean on the labels.
+
+    Returns:
+        Root mean square error of the last pass [1].
+    """
     optimizer = torch.optim.Adam(networks.actor.parameters(), lr=config.lr)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.epochs, eta_min=0.1 * config.lr)
     error = 0.0

@@ -221,8 +221,8 @@ def adapted_rate(rate: float, divergence: float, config: PPOConfig) -> float:
 
     Examples:
         >>> from cura_torchrl.trainers.config import PPOConfig
-        >>> adapted_rate(3e-4, 0.03, PPOConfig(target_kl=0.01))
-        0.0002
+        >>> adapted_rate(0.003, 0.03, PPOConfig(target_kl=0.01))  # 0.003 / 1.5
+        0.002
     """
     if config.target_kl == 0.0:
         return rate

@@ -23,6 +23,12 @@ _CHASSIS_RADIUS = 0.6
 _BODY_CLEARANCE = 0.08
 """Distance that the avoider's discs keep from obstacles [m]."""
 
+_NEAR = 0.1
+"""Gap between hand and face below which they count as touching [m]."""
+
+_RUDDER = 2.0
+"""Rate at which the line from hand to object is turned towards the goal, per angle [1/s]."""
+
 
 class ScriptedPusher(TensorDictModuleBase):
     """Go behind the object, push it towards the goal, correct sideways.
@@ -71,25 +77,21 @@ class ScriptedPusher(TensorDictModuleBase):
         to_goal = waypoint - centre
         distance = to_goal.norm(dim=-1, keepdim=True)
         along = to_goal / distance.clamp_min(1e-6)
-        across = torch.stack([-along[..., 1], along[..., 0]], dim=-1)
         offset = centre - tcp
-        ahead, aside = (offset * along).sum(-1, keepdim=True), (offset * across).sum(-1, keepdim=True)
-        turn = torch.atan2(along[..., 1], along[..., 0])[..., None]
-        # Behind the object the hand closes in; beside it, it first falls back to where it can come round.
-        standoff = 1.25 * half + 0.1
-        behind = (ahead > 0.75 * half) & (aside.abs() < 0.8 * half)
-        sideways = (2.0 * aside).clamp(-0.35, 0.35)
-        centred = (1.0 - aside.abs() / (0.8 * half + 1e-6)).clamp(0.15, 1.0)
-        gap = (ahead - half).clamp_min(0.0)
-        forward = torch.minimum(torch.full_like(distance, self.speed), 0.12 + 1.2 * distance) * centred
-        forward = torch.where(gap > 0.15, torch.minimum(forward, 0.2 + gap), forward)
-        retreat = (1.5 * (ahead - standoff)).clamp(-0.6, 0.3)
-        sideways = torch.where(behind, sideways, 2.0 * sideways)
-        velocity = torch.where(behind, forward, retreat) * along + sideways * across
+        reach = offset.norm(dim=-1, keepdim=True)
+        ahead, aside = _components(offset, along)
+        gap = reach - _face_distance(offset, parts["object_heading"], half)
+        # Behind the object the hand pushes; beside it, it comes round. Once it is off the object it has to be well
+        # behind: else it would meet the same face at the same place again.
+        behind = (ahead > 0.0) & (aside.abs() < torch.where(gap > _NEAR, 0.35, 0.7) * half)
+        speed = torch.minimum(torch.full_like(distance, self.speed), 0.12 + 1.2 * distance)
+        direction = offset / reach.clamp_min(1e-6)
+        push = _push(direction, reach, torch.atan2(aside, ahead), gap, speed)
+        velocity = torch.where(behind, push, _come_round(direction, along, ahead, aside, gap, half))
         velocity = torch.where(distance < 0.03, torch.zeros_like(velocity), velocity)
         # Half a diagonal: whichever way the object is turned.
         velocity = self._keep_clear(centre, 1.42 * half[..., 0], velocity)
-        return self._share(tcp, velocity, turn)
+        return self._share(tcp, velocity, geometry.angle_of(along)[..., None])
 
     def _keep_clear(self, centre: torch.Tensor, radius: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:  # noqa: ARG002
         """Return the velocity of a disc, base frame [m/s], less what would bring it into an obstacle."""
@@ -175,3 +177,53 @@ class ScriptedAvoider(ScriptedPusher):
 def _in_base_frame(base: torch.Tensor, obstacles: torch.Tensor) -> torch.Tensor:
     position = geometry.to_frame(base[:, None].expand(-1, obstacles.shape[1], -1), obstacles[..., :2])
     return torch.cat([position, obstacles[..., 2:3] - base[:, None, 2:], obstacles[..., 3:]], dim=-1)
+
+
+def _push(
+    direction: torch.Tensor, reach: torch.Tensor, error: torch.Tensor, gap: torch.Tensor, speed: torch.Tensor
+) -> torch.Tensor:
+    """Return the hand's velocity behind the object.
+
+    The hand sticks to the face, so the object follows the line from the hand through its centre, and turns with what
+    the hand moves across that line. So the line is turned towards the goal as by a rudder.
+    """
+    forward = speed * error.cos().clamp_min(0.3)
+    forward = torch.where(gap > _NEAR, torch.minimum(forward, 0.2 + gap), forward)
+    rudder = (_RUDDER * reach * error).clamp(-0.4, 0.4)
+    return forward * direction + rudder * _left(direction)
+
+
+def _come_round(
+    direction: torch.Tensor,
+    along: torch.Tensor,
+    ahead: torch.Tensor,
+    aside: torch.Tensor,
+    gap: torch.Tensor,
+    half: torch.Tensor,
+) -> torch.Tensor:
+    """Return the hand's velocity beside the object: off it first, for it would drag it along, then behind it."""
+    retreat = (1.5 * (ahead - 1.25 * half - 0.1)).clamp(-0.6, 0.3)
+    round_it = retreat * along + (4.0 * aside).clamp(-0.6, 0.6) * _left(along)
+    return torch.where(gap > _NEAR, round_it, -0.5 * direction)
+
+
+def _left(direction: torch.Tensor) -> torch.Tensor:
+    return torch.stack([-direction[..., 1], direction[..., 0]], dim=-1)
+
+
+def _components(vector: torch.Tensor, along: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return a vector's components along a direction and to its left, shape ``[*, 1]`` each."""
+    return (vector * along).sum(-1, keepdim=True), (vector * _left(along)).sum(-1, keepdim=True)
+
+
+def _face_distance(offset: torch.Tensor, heading: torch.Tensor, half: torch.Tensor) -> torch.Tensor:
+    """Return how far a square's outline is from its centre, seen from a point [m], shape ``[*, 1]``.
+
+    Args:
+        offset: From the point to the centre [m], shape ``[*, 2]``.
+        heading: Cosine and sine of four times the square's yaw [1], shape ``[*, 2]``.
+        half: Half its edge [m], shape ``[*, 1]``.
+    """
+    yaw = torch.atan2(heading[..., 1], heading[..., 0]) / 4
+    bearing = geometry.quarter_turn(geometry.angle_of(offset) - yaw)
+    return half / bearing.cos()[..., None]

@@ -84,3 +84,10 @@ def test_the_same_evaluation_gives_the_same_result() -> None:
     """Catches an evaluation that depends on what was played before."""
     config = EvaluateConfig(policy="random", episodes=2, chunk=2, object_size=1.0)
     assert evaluate(config) == evaluate(config)
+
+
+@pytest.mark.slow
+def test_the_result_does_not_depend_on_the_number_of_processes() -> None:
+    """Catches processes that play the same scenes, or a scene that depends on who plays it."""
+    config = EvaluateConfig(policy="scripted", episodes=3, chunk=2)
+    assert evaluate(config) == evaluate(dataclasses.replace(config, num_workers=2))
