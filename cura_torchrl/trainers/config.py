@@ -45,13 +45,15 @@ class PPOConfig:
     value_scale: float = 100.0
     """Magnitude of the returns [1]: the critic's network and its squared error are in units of it."""
     max_grad_norm: float = 1.0
-    """Norm that the gradient of actor and critic is clipped to [1]."""
+    """Norm that the gradient of the actor, and that of the critic, is clipped to [1]."""
+    critic_lr: float = 5e-4
+    """Learning rate of the critic [1]; it does not adapt."""
     lr: float = 1e-3
-    """Learning rate at the start [1]."""
+    """Learning rate of the actor at the start [1]."""
     min_lr: float = 1e-5
-    """Smallest learning rate [1]."""
+    """Smallest learning rate of the actor [1]."""
     max_lr: float = 1e-2
-    """Largest learning rate [1]."""
+    """Largest learning rate of the actor [1]."""
     target_kl: float = 0.01
     """KL divergence from the old to the new policy that the learning rate aims at [nat]; 0 keeps the rate fixed."""
     lr_factor: float = 1.5
@@ -67,6 +69,7 @@ class PPOConfig:
             "minibatch_size",
             "rollout_steps",
             "max_grad_norm",
+            "critic_lr",
             "min_lr",
             "value_scale",
         ):

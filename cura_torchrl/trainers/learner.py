@@ -49,12 +49,13 @@ class Learner:
         self._config = config
         self._advantage = build_advantage(config, networks)
         self._loss_module = build_loss(config, networks)
-        self._policy_parameters = [*networks.actor.parameters(), *networks.critic.parameters()]
-        self._collision_parameters = [*networks.collision_estimator.parameters()]
-        self._optimizer = torch.optim.Adam(self._policy_parameters, lr=config.ppo.lr)
-        # In a shared clip the estimator's energy distance would be lost beside the critic's loss, and its learning rate
-        # must not follow the policy's KL divergence.
-        self._collision_optimizer = torch.optim.Adam(self._collision_parameters, lr=config.cura.lr)
+        # Each network has its own clip, in which the largest loss would decide for all, and its own learning rate: that
+        # of the actor follows its KL divergence, and with small batches falls to where a critic would not learn.
+        self._parts = {
+            "actor": _Part(networks.actor, config.ppo.lr, config.ppo.max_grad_norm),
+            "critic": _Part(networks.critic, config.ppo.critic_lr, config.ppo.max_grad_norm),
+            "collision": _Part(networks.collision_estimator, config.cura.lr, config.cura.max_grad_norm),
+        }
         size = min(config.ppo.minibatch_size, config.frames_per_batch)
         self._buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(config.frames_per_batch),
@@ -70,8 +71,7 @@ class Learner:
         """
         return {
             "networks": self.networks,
-            "optimizer": self._optimizer,
-            "collision_optimizer": self._collision_optimizer,
+            **{f"{name}_optimizer": part.optimizer for name, part in self._parts.items()},
             "counters": self,
         }
 
@@ -125,7 +125,7 @@ class Learner:
         self.frames += batch.numel()
         self.updates += 1
         metrics |= {name: (value / count).item() for name, value in sums.items()}
-        return metrics | {"lr": self._optimizer.param_groups[0]["lr"], "std": data["scale"].mean().item()}
+        return metrics | {"lr": self._parts["actor"].rate, "std": data["scale"].mean().item()}
 
     @torch.no_grad()
     def _estimate(self, data: TensorDictBase) -> dict[str, float]:
@@ -149,24 +149,20 @@ class Learner:
             raise NonFiniteError(f"{bad} is not finite at {self.frames} frames; the last checkpoint is intact")
         if self.frames < self._config.ppo.critic_warmup_frames:
             total = total - losses["loss_objective"] - losses["loss_entropy"]
-        self._optimizer.zero_grad(set_to_none=True)
-        self._collision_optimizer.zero_grad(set_to_none=True)
+        for part in self._parts.values():
+            part.optimizer.zero_grad(set_to_none=True)
         total.backward()
-        norms = {
-            "grad_norm": self._clip(self._policy_parameters, self._config.ppo.max_grad_norm, "actor and critic"),
-            "collision_grad_norm": self._clip(self._collision_parameters, self._config.cura.max_grad_norm, "estimator"),
-        }
-        self._optimizer.step()
-        self._collision_optimizer.step()
+        norms = {f"{name}_grad_norm": self._clip(name, part) for name, part in self._parts.items()}
+        for part in self._parts.values():
+            part.optimizer.step()
         scalars = {name: value.detach().mean() for name, value in losses.items() if name in _LOGGED or name in terms}
         return {**scalars, **norms, "kl": divergence}
 
-    def _clip(self, parameters: list[torch.nn.Parameter], limit: float, whose: str) -> torch.Tensor:
-        norm = clip_grad_norm_(parameters, limit)
+    def _clip(self, name: str, part: _Part) -> torch.Tensor:
+        norm = clip_grad_norm_(part.parameters, part.max_grad_norm)
         if not torch.isfinite(norm):
-            raise NonFiniteError(
-                f"gradient of {whose} is not finite at {self.frames} frames; the last checkpoint is intact"
-            )
+            msg = f"gradient of the {name} network is not finite at {self.frames} frames; the last checkpoint is intact"
+            raise NonFiniteError(msg)
         return norm
 
     @torch.no_grad()
@@ -176,9 +172,26 @@ class Learner:
         return gaussian_divergence(minibatch["loc"], minibatch["scale"], now["loc"], now["scale"]).mean()
 
     def _adapt_rate(self, divergence: float) -> None:
-        rate = adapted_rate(self._optimizer.param_groups[0]["lr"], divergence, self._config.ppo)
-        for group in self._optimizer.param_groups:
-            group["lr"] = rate
+        part = self._parts["actor"]
+        part.rate = adapted_rate(part.rate, divergence, self._config.ppo)
+
+
+class _Part:
+    """A network's parameters and what steps them."""
+
+    def __init__(self, network: torch.nn.Module, lr: float, max_grad_norm: float) -> None:
+        self.parameters = [*network.parameters()]
+        self.max_grad_norm = max_grad_norm
+        self.optimizer = torch.optim.Adam(self.parameters, lr=lr)
+
+    @property
+    def rate(self) -> float:
+        """Learning rate [1]."""
+        return float(self.optimizer.param_groups[0]["lr"])
+
+    @rate.setter
+    def rate(self, value: float) -> None:
+        self.optimizer.param_groups[0]["lr"] = value
 
 
 def gaussian_divergence(
