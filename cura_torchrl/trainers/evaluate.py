@@ -26,7 +26,7 @@ from cura_torchrl.trainers.statistics import wilson_interval
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
@@ -66,12 +66,15 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
         CheckpointError: If the policy's checkpoint is missing or damaged.
     """  # noqa: DOC502 - raised by what this calls
     source = _source(config)
+    episodes: list[Episode] = []
     with tqdm(total=config.episodes, unit="episode", file=sys.stderr) as bar:
-        episodes: list[Episode] = []
-        for played in _play_all(config):
-            episodes += played
-            bar.update(len(played))
-            bar.set_postfix_str(f"success {sum(episode.success[0] for episode in episodes) / len(episodes):.1%}")
+
+        def add(episode: Episode) -> None:
+            episodes.append(episode)
+            bar.update()
+            bar.set_postfix_str(f"success {sum(played.success[0] for played in episodes) / len(episodes):.1%}")
+
+        _play_all(config, add)
     return {**source, **summarise(episodes), **_settings(config)}
 
 
@@ -122,20 +125,17 @@ class Player:
         """Close the worlds."""
         self._env.close()
 
-    def play(self, chunk: int) -> list[Episode]:
-        """Play one chunk of scenarios, each once.
+    def play(self, part: int, report: Callable[[Episode], object]) -> None:
+        """Play one part of the scenarios, each once.
 
         Args:
-            chunk: Index of the chunk.
-
-        Returns:
-            Its episodes in order; the last chunk's surplus is left out.
+            part: Index of the part; how many there are depends on the configuration alone.
+            report: Called with every episode when it is over.
         """
-        size = self._config.chunk
-        first = chunk * size
-        torch.manual_seed(self._config.seed * 1_000_003 + chunk)  # random actions only; all else is deterministic
-        episodes = play_episodes(self._env, self._policy, torch.arange(first, first + size))
-        return episodes[: self._config.episodes - first]
+        first = part * _part_size(self._config)
+        last = min(first + _part_size(self._config), self._config.episodes)
+        torch.manual_seed(self._config.seed * 1_000_003 + part)  # random actions only; all else is deterministic
+        play_episodes(self._env, self._policy, torch.arange(first, last), report=report)
 
 
 @torch.no_grad()
@@ -144,43 +144,54 @@ def play_episodes(
     policy: Callable[[TensorDictBase], TensorDictBase],
     indices: torch.Tensor,
     *,
-    watch: Callable[[TensorDictBase, torch.Tensor], None] | None = None,
+    report: Callable[[Episode], object] | None = None,
+    watch: Callable[[TensorDictBase, torch.Tensor], object] | None = None,
 ) -> list[Episode]:
-    """Play one scenario in each world, with the policy's mean action.
+    """Play scenarios, each once, with the policy's mean action.
+
+    A world whose episode is over takes the next scenario that waits; where none does it stands still, so that the
+    policy's batch keeps its size, on which the last bits of its actions depend.
 
     Args:
         env: N worlds.
         policy: Writes the action.
-        indices: Scenarios to play, int64, shape ``[N]``.
+        indices: Scenarios to play, int64, shape ``[M]``, M at least 1.
+        report: Called with every episode when it is over.
         watch: Called with what the environment emits at the start and after every step, batch size ``[N]``, and with
             the rows that were being played until then, bool, shape ``[N]``.
 
     Returns:
         How they were played, in the order of ``indices``.
     """
+    num_worlds, waiting = env.batch_size[0], iter(range(len(indices)))
+    # Which of the scenarios each world plays, -1 for none.
+    playing = torch.tensor([next(waiting, -1) for _ in range(num_worlds)])
+    reached = torch.zeros(num_worlds, dtype=torch.int64)
+    outcomes: dict[int, Episode] = {}
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        state = env.reset(episodes=indices)
-        outcomes: dict[int, Episode] = {}
-        reached = torch.zeros(len(indices), dtype=torch.int64)
-        is_over = torch.zeros(len(indices), dtype=torch.bool)
+        state = env.reset(episodes=indices[playing.clamp_min(0)])
         if watch is not None:
-            watch(state, ~is_over)
-        while not is_over.all():
+            watch(state, playing >= 0)
+        while len(outcomes) < len(indices):
             state = policy(state)
-            # A world that is over stands still until the others are: what happens there no longer counts.
-            state[keys.ACTION] = torch.where(is_over.unsqueeze(-1), 0.0, state[keys.ACTION])
+            state[keys.ACTION] = torch.where(playing.unsqueeze(-1) < 0, 0.0, state[keys.ACTION])
             after = env.step(state)["next"]
             if watch is not None:
-                watch(after, ~is_over)
-            steps = after[keys.ELAPSED_STEPS].squeeze(-1)
+                watch(after, playing >= 0)
             is_new = after[keys.SUCCESS][:, 0] & (reached == 0)
-            reached = torch.where(is_new, steps, reached)
-            ended = after["done"].squeeze(-1) & ~is_over
-            for row in ended.nonzero().flatten().tolist():
-                outcomes[row] = _episode(int(indices[row]), after[row], int(reached[row]))
-            is_over |= ended
+            reached = torch.where(is_new, after[keys.ELAPSED_STEPS].squeeze(-1), reached)
+            has_ended = after["done"].squeeze(-1) & (playing >= 0)
+            for row in has_ended.nonzero().flatten().tolist():
+                number = int(playing[row])
+                outcomes[number] = _episode(int(indices[number]), after[row], int(reached[row]))
+                if report is not None:
+                    report(outcomes[number])
+                playing[row], reached[row] = next(waiting, -1), 0
             state = step_mdp(state)
-    return [outcomes[row] for row in range(len(indices))]
+            is_fresh = has_ended & (playing >= 0)
+            if is_fresh.any():
+                state = env.reset(state.set("_reset", is_fresh[:, None]), episodes=indices[playing.clamp_min(0)])
+    return [outcomes[number] for number in range(len(indices))]
 
 
 def _episode(index: int, last: TensorDictBase, reached: int) -> Episode:
@@ -196,20 +207,30 @@ def _episode(index: int, last: TensorDictBase, reached: int) -> Episode:
     )
 
 
-def _play_all(config: EvaluateConfig) -> Iterator[list[Episode]]:
-    chunks = range(-(-config.episodes // config.chunk))
+def _part_size(config: EvaluateConfig) -> int:
+    """Return how many episodes a process plays at a time [1]; fixed, so that results do not depend on their number."""
+    return 5 * config.chunk
+
+
+def _play_all(config: EvaluateConfig, report: Callable[[Episode], object]) -> None:
+    parts = range(-(-config.episodes // _part_size(config)))
     if config.num_workers == 1:
         with one_thread(), closing(Player(config)) as player:
-            yield from map(player.play, chunks)
+            for part in parts:
+                player.play(part, report)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(config.num_workers, len(chunks)), mp_context=context) as pool:
-        yield from pool.map(functools.partial(_play_in_worker, config), chunks)
+    with ProcessPoolExecutor(min(config.num_workers, len(parts)), mp_context=context) as pool:
+        for played in pool.map(functools.partial(_play_in_worker, config), parts):
+            for episode in played:
+                report(episode)
 
 
-def _play_in_worker(config: EvaluateConfig, chunk: int) -> list[Episode]:
+def _play_in_worker(config: EvaluateConfig, part: int) -> list[Episode]:
+    played: list[Episode] = []
     with one_thread():
-        return _worker_player(config).play(chunk)
+        _worker_player(config).play(part, played.append)
+    return played
 
 
 @functools.lru_cache(maxsize=1)

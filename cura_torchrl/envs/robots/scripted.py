@@ -119,7 +119,8 @@ class ScriptedAvoider(ScriptedPusher):
     Args:
         robot: Limits that actions are shares of.
         speed: Pushing speed [m/s].
-        margin: Least distance between the object's inscribed circle and an obstacle that a route keeps [m].
+        margin: Distance that a route keeps between an obstacle and the wider of the object's inscribed circle and the
+            chassis, which follows and cuts corners [m].
         look_ahead: How far along the route the object is sent [m].
     """
 
@@ -138,7 +139,7 @@ class ScriptedAvoider(ScriptedPusher):
         base = tensordict[keys.SENSOR_POSE]
         goal = geometry.from_frame(base, parts["goal_position"])
         centre = geometry.from_frame(base, parts["object_position"][..., :2])
-        radius = parts["object_position"][..., 2] + self.margin
+        radius = parts["object_position"][..., 2].clamp_min(_CHASSIS_RADIUS) + self.margin
         self._plan(tensordict[keys.OBSTACLES], goal, radius)
         self._obstacles_b = _in_base_frame(base, tensordict[keys.OBSTACLES])
         cells = round(self.look_ahead / route.CELL)

@@ -8,10 +8,11 @@ import json
 import pytest
 import torch
 
-from cura_torchrl.envs.config import PushEnvConfig, TaskConfig
+from cura_torchrl.envs.config import MapConfig, PushEnvConfig, TaskConfig
 from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.trainers import evaluate as module
-from cura_torchrl.trainers.config import EvaluateConfig
+from cura_torchrl.trainers.build import Networks, make_env
+from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.evaluate import Episode, evaluate, play_episodes, summarise
 
 REQUIRED = {
@@ -43,21 +44,68 @@ def test_outcomes_add_up_to_the_episodes() -> None:
     assert (result["wilson_low"], result["wilson_high"]) == pytest.approx((0.150039, 0.849961), abs=1e-5)
 
 
-def test_a_world_that_is_over_waits_for_the_others_and_is_counted_once() -> None:
-    """Catches an auto-reset in evaluation, which would count more scenes of those that end early."""
-    task = TaskConfig(stream="eval", episode_time=1.0)
-    env = PushEnv(2, PushEnvConfig(task=task))
-    seen = []
+def test_a_world_that_is_over_takes_the_next_scene_or_stands_still() -> None:
+    """Catches scenes that are left out or counted twice: those that end early would weigh more or less than others."""
+    env = PushEnv(2, PushEnvConfig(task=TaskConfig(stream="eval", episode_time=1.0)))
+    seen, told = [], []
     try:
         played = play_episodes(
-            env, env.rand_action, torch.tensor([7, 3]), watch=lambda state, rows: seen.append((state["episode"], rows))
+            env,
+            env.rand_action,
+            torch.tensor([7, 3, 11]),
+            report=told.append,
+            watch=lambda state, rows: seen.append((state["episode"].flatten().tolist(), rows.tolist())),
         )
     finally:
         env.close()
-    assert [entry.index for entry in played] == [7, 3]
-    assert [entry.steps for entry in played] == [5, 5]  # 1 s at 5 Hz
-    assert all(state.flatten().tolist() == [7, 3] for state, _ in seen)
-    assert len(seen) == 6
+    assert [entry.index for entry in played] == [7, 3, 11]
+    assert told == played
+    assert [entry.steps for entry in played] == [5, 5, 5]  # 1 s at 5 Hz
+    # The start and five steps of two scenes, then five steps of the third while the other world stands still.
+    assert seen == [([7, 3], [True, True])] * 6 + [([11, 3], [True, False])] * 5
+
+
+def test_a_single_scene_is_played_once_whatever_the_number_of_worlds() -> None:
+    """Catches worlds without a scene whose episodes are counted."""
+    env = PushEnv(2, PushEnvConfig(task=TaskConfig(stream="eval", episode_time=1.0)))
+    seen = []
+    try:
+        played = play_episodes(
+            env, env.rand_action, torch.tensor([5]), watch=lambda _, rows: seen.append(rows.tolist())
+        )
+    finally:
+        env.close()
+    assert [(entry.index, entry.steps) for entry in played] == [(5, 5)]
+    assert seen == [[True, False]] * 6
+
+
+def windows_of(scenes: list[int]) -> torch.Tensor:
+    """The maps of one world that plays scenes of 15 steps, an untrained policy pushing, shape ``[steps, 2, 20, 20]``."""
+    config = TrainConfig(
+        perception="none",
+        map=MapConfig(window=20),
+        env=PushEnvConfig(task=TaskConfig(stream="eval", episode_time=3.0)),
+    )
+    env, windows = make_env(config, 1, keep_map=True), []
+    torch.manual_seed(0)
+    try:
+        play_episodes(
+            env,
+            Networks(config).actor,
+            torch.tensor(scenes),
+            watch=lambda state, _: windows.append(state["confidence_map"][0]),
+        )
+    finally:
+        env.close()
+    return torch.stack(windows)
+
+
+def test_what_is_seen_in_a_scene_does_not_depend_on_the_scenes_before_it() -> None:
+    """Catches a map, a pose or a clock that is carried from one scene of a world to the next."""
+    # The start is watched in the first scene only: scene 9 is windows 16 to 30 in one order, 31 to 45 in the other.
+    second, third = windows_of([4, 9, 2])[16:31], windows_of([2, 4, 9])[31:46]
+    assert torch.equal(second, third)
+    assert not torch.equal(second[0], second[-1])
 
 
 @pytest.fixture
@@ -74,7 +122,7 @@ def test_the_result_has_what_scripts_rely_on_and_is_json() -> None:
     """Catches a renamed key, and a number that JSON does not know."""
     result = evaluate(EvaluateConfig(policy="random", episodes=3, chunk=2, max_obstacles=0))
     assert set(result) >= REQUIRED
-    assert result["episodes"] == 3  # the second chunk's surplus is not counted
+    assert result["episodes"] == 3  # the second world stands still in the end
     assert (result["method"], result["timeouts"], result["mean_steps"]) == ("random", 3, 5.0)
     json.dumps(result, allow_nan=False)
 

@@ -89,6 +89,21 @@ def test_a_target_of_zero_keeps_the_rate() -> None:
     assert adapted_rate(3e-4, 1.0, PPOConfig(target_kl=0.0)) == 3e-4
 
 
+def test_the_critic_keeps_its_rate_when_that_of_the_actor_falls() -> None:
+    """Catches a critic that stops learning because small batches make the policy's steps small."""
+    config, learner = build(target_kl=1e-9, lr=1e-3, min_lr=1e-5)
+    metrics = learner.update(rollout(learner))
+    rates = {
+        name: component.param_groups[0]["lr"]
+        for name, component in learner.components().items()
+        if name.endswith("optimizer")
+    }
+    # 19 of 20 minibatches come after the first step, which moves the policy: 1e-3 / 1.5 ** 19 is below the bound.
+    assert metrics["lr"] == rates["actor_optimizer"] == 1e-5
+    assert rates["critic_optimizer"] == config.ppo.critic_lr
+    assert rates["collision_optimizer"] == config.cura.lr
+
+
 def test_an_update_changes_all_networks_and_reports_finite_numbers() -> None:
     """Catches a network that no optimiser holds."""
     _, learner = build()
