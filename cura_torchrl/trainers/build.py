@@ -52,6 +52,7 @@ class Networks(nn.Module):
             ACTION_SIZE,
             hidden_sizes=sizes.actor_hidden_sizes,
             init_std=sizes.init_std,
+            min_std=sizes.min_std,
             observation_norm=self.observation_norm,
         )
         self.critic = make_critic(

@@ -133,13 +133,16 @@ class NetworkConfig:
     """Sizes of the collision estimator's hidden layers [1]."""
     init_std: float = 0.6
     """Standard deviation of the normalised action at the start [1]."""
+    min_std: float = 0.05
+    """What the standard deviation of the normalised action stays above [1]."""
 
     def __post_init__(self) -> None:
         require_finite(self)
         for name in ("actor_hidden_sizes", "critic_hidden_sizes", "collision_hidden_sizes"):
             sizes = getattr(self, name)
             require(bool(sizes) and min(sizes, default=0) > 0, name, sizes, "one or more positive sizes")
-        require(self.init_std > 0, "init_std", self.init_std, "a positive number")
+        require(self.min_std > 0, "min_std", self.min_std, "a positive number")
+        require(self.init_std > self.min_std, "init_std", self.init_std, f"a number larger than min_std {self.min_std}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -80,7 +80,7 @@ def test_a_single_scene_is_played_once_whatever_the_number_of_worlds() -> None:
 
 
 def windows_of(scenes: list[int]) -> torch.Tensor:
-    """The maps of one world that plays scenes of 15 steps, an untrained policy pushing, shape ``[steps, 2, 20, 20]``."""
+    """What one world sees in scenes of 15 steps under an untrained policy, shape ``[steps, 2, 20, 20]``."""
     config = TrainConfig(
         perception="none",
         map=MapConfig(window=20),
