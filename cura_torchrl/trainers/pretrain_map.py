@@ -166,7 +166,9 @@ def pretrain_map(
         figures |= {f"{name}, decay {decay:g}": value for name, value in scores.items()}
     vae.save(config.run_dir / WEIGHTS_NAME)
     _draw(vae, data, held_out, table, config)
-    record = {"figures": figures, "config": encode(config), "versions": versions(), "commit": git_commit()}
+    # The folder of the machine that trained says nothing elsewhere.
+    told = dataclasses.replace(config, run_dir=PretrainMapConfig.run_dir)
+    record = {"figures": figures, "config": encode(told), "versions": versions(), "commit": git_commit()}
     _write(config.run_dir / FIGURES_NAME, json.dumps(record, indent=2) + "\n")
     logger.info("%s", ", ".join(f"{name} {value:.4g}" for name, value in figures.items()))
     return figures

@@ -53,7 +53,7 @@ def test_help_lists_every_command_and_method() -> None:
     """Catches a command that nobody finds."""
     done = run("--help")
     assert done.returncode == 0
-    for name in ("pretrain-map", "train", "evaluate", "demo", "info", *METHODS):
+    for name in ("pretrain-map", "imitate", "train", "evaluate", "release", "demo", "info", *METHODS):
         assert name in done.stdout
 
 
