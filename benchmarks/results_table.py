@@ -1,4 +1,4 @@
-"""Print the cells that evaluate_on_bullet.sh wrote as Markdown: success in per cent, Wilson's 95 % interval, collisions.
+"""Print the cells that evaluate_on_bullet.sh wrote as Markdown: success [%], Wilson's 95 % interval, collisions, time-outs.
 
 python benchmarks/results_table.py benchmarks/results/bullet
 """
@@ -20,7 +20,7 @@ def cell(result: dict[str, Any] | None) -> str:
         result: What ``evaluate --json`` printed; None where it was not played.
     """
     if result is None:
-        return "–"
+        return "-"
     rate, low, high = (100.0 * result[name] for name in ("success_rate", "wilson_low", "wilson_high"))
     return f"{rate:.1f} ({low:.0f} to {high:.0f}), {result['collisions']} / {result['timeouts']}"
 
