@@ -51,6 +51,28 @@ def test_it_backs_off_when_it_is_beside_the_object():
     assert act(ScriptedPusher(), (0.9, 0.6), (10.0, 0.6))[0] < 0
 
 
+def test_it_lets_go_before_it_comes_round():
+    """Catches a hand that drags the box along as it moves to its other side: both then circle the goal for ever."""
+    # The hand touches the box near its corner: 0.23 m behind its centre and 0.2 m to the right of it.
+    vx, vy, *_ = act(ScriptedPusher(), (1.13, 0.2), (10.0, 0.2))
+    assert vx < 0
+    assert vy < 0
+
+
+def test_off_the_box_it_gets_behind_its_middle_before_it_closes_in():
+    """Catches a hand that meets the same face at the same place again: 0.15 m aside is more than 0.35 of 0.25 m."""
+    vx, vy, *_ = act(ScriptedPusher(), (1.45, 0.15), (10.0, 0.15))
+    assert vy > vx > 0
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_it_steers_a_box_that_veers_off(side: float):
+    """Catches a rudder the wrong way round: the hand has to move to the side that the box veers to."""
+    straight = act(ScriptedPusher(), (1.15, 0.0), (10.0, 0.0))
+    veering = act(ScriptedPusher(), (1.15, 0.08 * side), (10.0, 0.08 * side))
+    assert (veering[1] - straight[1]) * side > 0.1
+
+
 def test_the_hand_stops_at_the_goal():
     """Catches a pusher that drives the box over the goal."""
     vx, vy, wz, ax, ay, _ = act(ScriptedPusher(), (1.15, 0.0), (1.15, 0.01))
