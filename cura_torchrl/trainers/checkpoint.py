@@ -70,7 +70,14 @@ def save_checkpoint(
     return destination
 
 
-def write_checkpoint(components: Mapping[str, Any], config: TrainConfig, destination: Path, *, frames: int) -> Path:
+def write_checkpoint(
+    components: Mapping[str, Any],
+    config: TrainConfig,
+    destination: Path,
+    *,
+    frames: int,
+    origin: Mapping[str, Any] | None = None,
+) -> Path:
     """Write components, configuration and hashes to a folder, replacing what is there.
 
     Args:
@@ -78,13 +85,14 @@ def write_checkpoint(components: Mapping[str, Any], config: TrainConfig, destina
         config: Resolved configuration.
         destination: Folder to write.
         frames: Environment steps so far [1].
+        origin: Versions and commit that the components were made with; None is those of this process.
 
     Returns:
         ``destination``.
     """
     stage = destination.parent / f"{_STAGE_PREFIX}{uuid.uuid4().hex}"
     try:
-        _fill(stage, components, config, frames)
+        _fill(stage, components, config, {"frames": frames, **(origin or _origin())})
         _publish(stage, destination)
     finally:
         shutil.rmtree(stage, ignore_errors=True)
@@ -277,10 +285,31 @@ def export_policy(source: Path, destination: Path | None = None) -> Path:
     # Paths of the machine that trained say nothing elsewhere.
     released = config.replace(run_dir=Path("runs") / config.method, encoder=None)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    curve = path.parents[1] / PROGRESS_NAME
+    curve = progress_path(path)
     if curve.exists():
-        shutil.copyfile(curve, folder.with_name(f"{folder.name}-{PROGRESS_NAME}"))
-    return write_checkpoint({"networks": networks}, released, folder, frames=record["frames"])
+        shutil.copyfile(curve, progress_path(folder))
+    origin = {name: record[name] for name in ("versions", "commit")}
+    return write_checkpoint({"networks": networks}, released, folder, frames=record["frames"], origin=origin)
+
+
+def progress_path(checkpoint: Path) -> Path:
+    """Return where the progress of the run lies that a checkpoint is of.
+
+    Args:
+        checkpoint: Folder of a checkpoint of a run, or of shipped weights.
+
+    Returns:
+        File of the run's folder, or, for shipped weights, the file beside their folder; it need not exist.
+
+    Examples:
+        >>> progress_path(Path("runs/a/checkpoints/checkpoint-1")).as_posix()
+        'runs/a/progress.csv'
+        >>> progress_path(Path("weights/push")).as_posix()
+        'weights/push-progress.csv'
+    """
+    if checkpoint.parent.name == CHECKPOINT_FOLDER:
+        return checkpoint.parents[1] / PROGRESS_NAME
+    return checkpoint.with_name(f"{checkpoint.name}-{PROGRESS_NAME}")
 
 
 def _resolve(source: str | Path) -> Path:
@@ -306,15 +335,13 @@ def _coordinator(components: Mapping[str, Any]) -> Checkpoint:
     return checkpoint
 
 
-def _fill(stage: Path, components: Mapping[str, Any], config: TrainConfig, frames: int) -> None:
-    _coordinator(components).save(stage, metadata={"frames": frames})
-    record = {
-        "config": config.to_json(),
-        "seed": config.seed,
-        "frames": frames,
-        "versions": versions(),
-        "commit": git_commit(),
-    }
+def _origin() -> dict[str, Any]:
+    return {"versions": versions(), "commit": git_commit()}
+
+
+def _fill(stage: Path, components: Mapping[str, Any], config: TrainConfig, facts: Mapping[str, Any]) -> None:
+    _coordinator(components).save(stage, metadata={"frames": facts["frames"]})
+    record = {"config": config.to_json(), "seed": config.seed, **facts}
     (stage / CONFIG_NAME).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     files = sorted(entry for entry in stage.rglob("*") if entry.is_file())
     lines = [f"{_sha256(file)}  {file.relative_to(stage).as_posix()}\n" for file in files]

@@ -14,14 +14,13 @@ import sys
 import webbrowser
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import closing, contextmanager
-from pathlib import Path  # noqa: TC003 - doctest
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
 from cura_torchrl.trainers import figures, render
 from cura_torchrl.trainers.build import load_encoder
-from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, load_policy
+from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, load_policy, progress_path
 from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError, UnavailableError
 from cura_torchrl.trainers.evaluate import summarise
@@ -35,6 +34,7 @@ from cura_torchrl.trainers.train import most_obstacles, train
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
 
     from cura_torchrl.envs.config import TaskConfig
     from cura_torchrl.trainers.checkpoint import LoadedPolicy
@@ -330,23 +330,3 @@ def _continued(
         ppo=dataclasses.replace(run.ppo, lr=min(max(rate, run.ppo.min_lr), run.ppo.max_lr), critic_warmup_frames=0),
         cura=dataclasses.replace(run.cura, costs_start_frames=0),
     )
-
-
-def progress_path(checkpoint: Path) -> Path:
-    """Return where the progress of the run lies that a checkpoint is of.
-
-    Args:
-        checkpoint: Folder of a checkpoint of a run, or of shipped weights.
-
-    Returns:
-        File of the run's folder, or, for shipped weights, the file beside their folder; it need not exist.
-
-    Examples:
-        >>> progress_path(Path("runs/a/checkpoints/checkpoint-1")).as_posix()
-        'runs/a/progress.csv'
-        >>> progress_path(Path("weights/push")).as_posix()
-        'weights/push-progress.csv'
-    """
-    if checkpoint.parent.name == CHECKPOINT_FOLDER:
-        return checkpoint.parents[1] / PROGRESS_NAME
-    return checkpoint.with_name(f"{checkpoint.name}-{PROGRESS_NAME}")

@@ -17,6 +17,7 @@ from cura_torchrl.trainers.checkpoint import (
     export_policy,
     find_checkpoint,
     load_policy,
+    progress_path,
     read_config,
     restore,
     save_checkpoint,
@@ -25,6 +26,7 @@ from cura_torchrl.trainers.checkpoint import (
 )
 from cura_torchrl.trainers.errors import CheckpointError
 from cura_torchrl.trainers.methods import method
+from cura_torchrl.trainers.progress import PROGRESS_NAME
 
 
 def save(folder: Path, frames: int, **options: int) -> tuple[Path, nn.Module]:
@@ -160,6 +162,19 @@ def test_a_configuration_that_does_not_fit_names_its_key(saved: Path) -> None:
         read_config(saved)
 
 
+def test_exported_weights_say_what_trained_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches weights that name the commit of their release, from which nobody can make them again."""
+    config = method("push").replace(run_dir=tmp_path / "run", perception="none")
+    monkeypatch.setattr(module, "git_commit", lambda: "of the training")
+    save_checkpoint({"networks": Networks(config)}, config, tmp_path / "run" / CHECKPOINT_FOLDER, frames=7)
+    (tmp_path / "run" / PROGRESS_NAME).write_text("frames\n7\n", encoding="utf-8")
+    monkeypatch.setattr(module, "git_commit", lambda: "of the release")
+    released = export_policy(tmp_path / "run", tmp_path / "release" / "push")
+    assert read_config(released)[1]["commit"] == "of the training"
+    curve = tmp_path / "release" / f"push-{PROGRESS_NAME}"
+    assert curve.read_text(encoding="utf-8") == "frames\n7\n"
+
+
 def test_exported_weights_load_by_path_and_act_alike(tmp_path: Path) -> None:
     """Catches a release without the normalisation's statistics, which acts otherwise than the run did."""
     config = method("push").replace(run_dir=tmp_path / "run", perception="none")
@@ -196,3 +211,9 @@ def test_a_method_without_shipped_weights_and_a_wrong_path_are_told_apart(
         load_policy("nowhere")
     with pytest.raises(CheckpointError, match="no checkpoint at"):
         load_policy(tmp_path)
+
+
+def test_progress_lies_in_the_run_or_beside_shipped_weights() -> None:
+    """Catches a curve looked for inside of a checkpoint, whose files are all hashed."""
+    assert progress_path(Path("a/checkpoints/checkpoint-12")) == Path("a/progress.csv")
+    assert progress_path(Path("weights/cura-ppo")) == Path("weights/cura-ppo-progress.csv")

@@ -15,7 +15,7 @@ from cura_torchrl.modules import MapVAE
 from cura_torchrl.trainers.build import Networks
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint, read_config, save_checkpoint
 from cura_torchrl.trainers.config import NetworkConfig
-from cura_torchrl.trainers.demo import PAGE_NAME, TRAINING_FOLDER, DemoConfig, demo, most_telling, progress_path
+from cura_torchrl.trainers.demo import PAGE_NAME, TRAINING_FOLDER, DemoConfig, demo, most_telling
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.methods import METHODS, method
@@ -158,9 +158,3 @@ def test_telling_scenes_differ_in_outcome_then_are_close_calls() -> None:
     ]
     assert [found[0].scene.index for found in most_telling(pairs, 5)] == [2, 3, 4, 5, 1]
     assert [found[0].scene.index for found in most_telling(pairs[::-1], 2)] == [2, 3]
-
-
-def test_progress_lies_in_the_run_or_beside_shipped_weights() -> None:
-    """Catches a curve looked for inside of a checkpoint, whose files are all hashed."""
-    assert progress_path(Path("a/checkpoints/checkpoint-12")) == Path("a/progress.csv")
-    assert progress_path(Path("weights/cura-ppo")) == Path("weights/cura-ppo-progress.csv")
