@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import logging
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
@@ -21,6 +21,9 @@ from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.methods import METHODS, method
 from cura_torchrl.trainers.progress import read_progress
 from tests.recordings import make_recording
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 FRAMES = 3000
 """Steps that the tiny runs claim to have been trained for."""
