@@ -1,0 +1,76 @@
+"""Draw the curves of runs side by side; a run is a method whose weights are shipped, or a folder.
+
+python benchmarks/learning_curves.py cura-ppo push --output docs/_static/learning_curves.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from cura_torchrl.trainers.checkpoint import find_checkpoint, load_policy, progress_path
+from cura_torchrl.trainers.methods import METHODS
+from cura_torchrl.trainers.progress import read_progress
+
+PANELS = (
+    ("success", "success rate, last 200 episodes [1]"),
+    ("collision", "collision rate, last 200 episodes [1]"),
+    ("timeout", "time-out rate, last 200 episodes [1]"),
+    ("object_speed", "speed of the object [m/s]"),
+    ("risk_auroc", "AUROC of the risk, collision within 2 s [1]"),
+    ("explained_variance", "variance that the critic explains [1]"),
+)
+WINDOW = 15
+"""Updates that a point is the mean of [1]."""
+
+
+def smooth(rows: list[dict[str, float]], name: str) -> tuple[list[float], list[float]]:
+    """Return environment steps [million] and moving means.
+
+    Args:
+        rows: Rows of a run's progress.
+        name: Column.
+    """
+    points = [(row["frames"] / 1e6, row[name]) for row in rows if math.isfinite(row.get(name, math.nan))]
+    windows = [points[max(0, end - WINDOW) : end] for end in range(1, len(points) + 1)]
+    return [window[-1][0] for window in windows], [sum(y for _, y in window) / len(window) for window in windows]
+
+
+def rows_of(run: str) -> list[dict[str, float]]:
+    """Return a run's progress.
+
+    Args:
+        run: Name of a method, or folder of a run.
+    """
+    source = load_policy(run).path if run in METHODS else find_checkpoint(Path(run))
+    return read_progress(progress_path(source))
+
+
+def main() -> None:
+    """Parse the command line and draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", help="methods whose weights are shipped, or folders of runs")
+    parser.add_argument("--output", type=Path, required=True, help="picture to write")
+    options = parser.parse_args()
+    figure = Figure(figsize=(11, 5.6), layout="constrained")
+    axes = figure.subplots(2, 3, sharex=True)
+    for run in options.runs:
+        rows = rows_of(run)
+        for axis, (name, _) in zip(axes.flat, PANELS, strict=True):
+            axis.plot(*smooth(rows, name), label=Path(run).name, linewidth=1.4)
+    for axis, (name, title) in zip(axes.flat, PANELS, strict=True):
+        axis.set_title(title, loc="left", fontsize=9)
+        axis.grid(alpha=0.3)
+        if name != "object_speed":
+            axis.set_ylim(0.0, 1.0)
+    for axis in axes[-1]:
+        axis.set_xlabel("environment steps [million]")
+    axes.flat[0].legend()
+    figure.savefig(options.output, dpi=110)
+
+
+if __name__ == "__main__":
+    main()
