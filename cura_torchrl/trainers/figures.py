@@ -16,7 +16,7 @@ from PIL import Image
 
 from cura_torchrl.envs.robots import ridgeback_franka as model
 from cura_torchrl.trainers import raster
-from cura_torchrl.trainers.raster import rectangle_corners
+from cura_torchrl.trainers.raster import rectangle_corners, two_digits
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -109,7 +109,7 @@ def distribution_figure(recordings: Sequence[Recording]) -> bytes:
             risk, uncertainty = recording.risk[step], recording.uncertainty[step]
             axis.hist(atoms, bins, weights=np.full(atoms.size, 1.0 / atoms.size), color=raster.UNCERTAINTY)
             axis.axvline(risk, color=raster.RISK, linewidth=1.8)
-            title = f"{name}: t = {recording.times[step]:.1f} s, R = {risk:.2f}, U = {uncertainty:.3f}"
+            title = f"{name}: t = {recording.times[step]:.1f} s, R = {two_digits(risk)}, U = {uncertainty:.3f}"
             axis.set_title(title, fontsize=9, loc="left")
             _tidy(axis)
         row[0].set_ylabel(f"{recording.label}\nshare of atoms [1]")

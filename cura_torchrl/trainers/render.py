@@ -306,7 +306,7 @@ def _draw_atoms(column: _Column, index: int) -> Image.Image:
 def _draw_numbers(frame: Image.Image, column: _Column, index: int) -> None:
     step, draw = _step(column, index), ImageDraw.Draw(frame)
     for panel, text, colour in (
-        (column.risk, f"{column.recording.risk[step]:.2f}", raster.RISK),
+        (column.risk, raster.two_digits(column.recording.risk[step]), raster.RISK),
         (column.uncertainty, f"{column.recording.uncertainty[step]:.3f}", raster.UNCERTAINTY),
     ):
         place = (panel.left + panel.width) * SCALE, (panel.top - 4) * SCALE
