@@ -79,7 +79,7 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["trian"], "'trian' is no command; accepted: pretrain-map, "),
+        (["trainn"], "'trainn' is no command; accepted: pretrain-map, "),
         (["train", "--method", "cura"], "method is 'cura' (did you mean cura-ppo?); accepted: cura-ppo, push"),
         (["train", "--num-evns", "3"], "Unrecognized options: --num-evns"),
         (["train", "--num-envs", "many"], "--num-envs"),
