@@ -17,7 +17,6 @@ from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint,
 from cura_torchrl.trainers.config import NetworkConfig
 from cura_torchrl.trainers.demo import PAGE_NAME, TRAINING_FOLDER, DemoConfig, demo, most_telling
 from cura_torchrl.trainers.errors import RunError
-from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.methods import METHODS, method
 from cura_torchrl.trainers.progress import read_progress
 from tests.recordings import make_recording
@@ -102,16 +101,17 @@ def test_several_processes_play_the_same(runs: tuple[str, str], tmp_path: Path) 
     assert alone == together
 
 
-def test_missing_weights_name_the_command_that_makes_them(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", METHODS)
+def test_missing_weights_name_the_command_that_makes_them(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a traceback, or an error after minutes, on a copy without weights."""
-    missing = [name for name in METHODS if name not in shipped_methods()]
-    if not missing:
-        pytest.skip("all weights are shipped")
+    monkeypatch.setattr("cura_torchrl.trainers.demo.shipped_methods", list)  # a copy without any
     with pytest.raises(RunError) as caught:
-        demo(DemoConfig(run_dir=tmp_path, policies=(missing[0], "push")))
+        demo(DemoConfig(run_dir=tmp_path, policies=(name, "runs/other")))
     message = str(caught.value)
-    assert f"cura-torchrl train --method {missing[0]} --run-dir runs/{missing[0]}" in message
-    assert f"cura-torchrl demo --policies runs/{missing[0]} push" in message
+    assert f"cura-torchrl train --method {name} --run-dir runs/{name}" in message
+    assert f"cura-torchrl demo --policies runs/{name} runs/other" in message
     assert "\n" not in message
 
 
