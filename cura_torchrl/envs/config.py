@@ -311,7 +311,11 @@ class PhysicsConfig:
     hand_friction: float = 1.5
     """Bullet's friction of the robot's links; Bullet multiplies it by the object's [1]."""
     solver_iterations: int = 50
-    """Constraint solver iterations per tick [1]."""
+    """Bullet's constraint solver iterations per tick [1]."""
+    planar_sweeps: int = 4
+    """Gauss-Seidel sweeps over the planar simulator's contacts per tick [1]."""
+    planar_correction: float = 0.2
+    """Share of an overlap that the planar simulator takes back in a tick; Bullet's default [1]."""
 
     def __post_init__(self) -> None:
         require_finite(self)

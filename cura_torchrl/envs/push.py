@@ -11,7 +11,8 @@ from torchrl.envs import EnvBase
 
 from cura_torchrl import keys
 from cura_torchrl.envs.config import PushEnvConfig
-from cura_torchrl.envs.mdp import geometry, scenarios
+from cura_torchrl.envs import geometry
+from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE, observe
 from cura_torchrl.envs.mdp.rewards import REWARD_TERM_NAMES, reward_terms
 from cura_torchrl.envs.mdp.terminations import endings, latch_success, success_flags

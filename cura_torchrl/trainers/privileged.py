@@ -9,7 +9,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 from cura_torchrl import keys
-from cura_torchrl.envs.mdp.geometry import to_frame
+from cura_torchrl.envs.geometry import to_frame
 
 if TYPE_CHECKING:
     from tensordict import NestedKey, TensorDictBase

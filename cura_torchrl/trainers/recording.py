@@ -13,7 +13,8 @@ import torch
 from numpy.typing import NDArray
 
 from cura_torchrl import keys
-from cura_torchrl.envs.mdp import geometry, scenarios
+from cura_torchrl.envs import geometry
+from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.robots import ridgeback_franka as model
 from cura_torchrl.modules.functional import atom_mean, atom_variance

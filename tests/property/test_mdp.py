@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cura_torchrl.envs.config import RewardConfig, ScenarioConfig
-from cura_torchrl.envs.mdp import geometry, rewards
+from cura_torchrl.envs import geometry
+from cura_torchrl.envs.mdp import rewards
 from cura_torchrl.envs.mdp.scenarios import sample_scenarios
 
 _lengths = st.floats(-20, 20)

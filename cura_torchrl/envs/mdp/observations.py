@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from cura_torchrl.envs.mdp import geometry
+from cura_torchrl.envs import geometry
 
 _SIZES = {
     "tcp_position": 3,

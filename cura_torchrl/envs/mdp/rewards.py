@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from cura_torchrl.envs.mdp import geometry
+from cura_torchrl.envs import geometry
 
 if TYPE_CHECKING:
     from cura_torchrl.envs.config import RewardConfig
@@ -20,7 +20,7 @@ def keypoint_reward(config: RewardConfig, object_corners: torch.Tensor, goal_cor
 
     Args:
         config: Weight and decay.
-        object_corners: Object's corners in the order of :func:`~cura_torchrl.envs.mdp.geometry.cube_corners` [m], shape
+        object_corners: Object's corners in the order of :func:`~cura_torchrl.envs.geometry.cube_corners` [m], shape
             ``[N, 8, 3]``.
         goal_corners: Goal's corners, same order [m], shape ``[N, 8, 3]``.
 

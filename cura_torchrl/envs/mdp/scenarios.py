@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDict
 
 from cura_torchrl.envs.config import require
-from cura_torchrl.envs.mdp import geometry
+from cura_torchrl.envs import geometry
 
 if TYPE_CHECKING:
     from cura_torchrl.envs.config import ScenarioConfig, Stream

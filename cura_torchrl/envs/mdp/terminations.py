@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from cura_torchrl.envs.mdp import geometry
+from cura_torchrl.envs import geometry
 
 if TYPE_CHECKING:
     from cura_torchrl.envs.config import TaskConfig

@@ -11,6 +11,9 @@ from cura_torchrl.envs.robots.ridgeback_franka import BASE_LINK, BASE_LINK_HEIGH
 class ArmKinematics:
     """Pose and Jacobian of the TCP in the base frame (on the ground below the base's centre).
 
+    Args:
+        device: Where the tensors live; the CPU when None.
+
     Examples:
         >>> arm = ArmKinematics()
         >>> position, rotation, jacobian = arm.forward(torch.zeros(2, 7, dtype=torch.float64))
@@ -18,9 +21,9 @@ class ArmKinematics:
         (torch.Size([2, 3]), torch.Size([2, 3, 3]), torch.Size([2, 6, 7]))
     """
 
-    def __init__(self) -> None:
+    def __init__(self, device: torch.device | None = None) -> None:
         chain = pk.build_serial_chain_from_urdf(URDF.read_bytes(), TCP_LINK, root_link_name=BASE_LINK)
-        self._chain = chain.to(dtype=torch.float64)
+        self._chain = chain.to(dtype=torch.float64, device=device)
 
     def forward(self, joint_position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return where the TCP is and how it moves with the joints.
@@ -64,7 +67,7 @@ def damped_least_squares(
     """
     rows, joints = jacobian.shape[-2:]
     transposed = jacobian.mT
-    gram = jacobian @ transposed + damping**2 * torch.eye(rows, dtype=jacobian.dtype)
+    gram = jacobian @ transposed + damping**2 * torch.eye(rows, dtype=jacobian.dtype, device=jacobian.device)
     inverse = torch.linalg.solve(gram, jacobian).mT  # J^T (J J^T + lambda^2 I)^-1, the Gram matrix being symmetric
     velocity = (inverse @ twist[..., None])[..., 0]
-    return velocity, torch.eye(joints, dtype=jacobian.dtype) - inverse @ jacobian
+    return velocity, torch.eye(joints, dtype=jacobian.dtype, device=jacobian.device) - inverse @ jacobian

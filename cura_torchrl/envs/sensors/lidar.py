@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from cura_torchrl.envs.mdp import geometry
+from cura_torchrl.envs import geometry
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,13 +10,13 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pybullet as bullet
 import torch
 
-from cura_torchrl.envs.simulation.interface import SceneState, WorldState
+from cura_torchrl.envs.simulation.interface import SceneState, SimulationError, TorqueLaw, WorldState
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -39,24 +39,6 @@ Few enough for their state to stay in the cache, enough to share numpy's overhea
 
 _BASE_LINKS = ("base_slide_x", "base_slide_y", "base_link")
 """The robot's first links; all later ones belong to the arm."""
-
-
-class SimulationError(RuntimeError):
-    """The simulator's state is not finite, or a ray would have lied."""
-
-
-class TorqueLaw(Protocol):
-    """What computes joint torques; see :class:`cura_torchrl.envs.robots.controller.ImpedanceController`."""
-
-    ik_ticks: int
-
-    def solve_ik(self) -> None:
-        """Plan the next ``ik_ticks`` ticks for all worlds."""
-        ...
-
-    def torques(self, rows: slice, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Return joint torques ``[B, J]`` of some worlds from joint positions and velocities of the same shape."""
-        ...
 
 
 class BulletWorlds:

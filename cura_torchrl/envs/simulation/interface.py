@@ -1,10 +1,15 @@
-"""What the task sees of a simulator: the batched state."""
+"""What the task and a simulator know of each other: the batched state, the scene, the control law."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import torch
+
+
+class SimulationError(RuntimeError):
+    """The simulator's state is not finite, or a ray would have lied."""
 
 
 @dataclass
@@ -49,3 +54,48 @@ class SceneState:
     """Its centre (x [m], y [m], yaw [rad]), shape ``[B, 3]``."""
     num_slots: int
     """Most obstacles that may appear."""
+
+
+@dataclass(frozen=True)
+class RobotShape:
+    """The robot seen from above, as a planar simulator takes it."""
+
+    chassis_size: tuple[float, float]
+    """Length and width of the chassis, a rectangle around the base's centre [m]."""
+    chassis_height: float
+    """Height above the ground at which the chassis pushes [m]."""
+    hand_size: tuple[float, float]
+    """Length and width of the hand, a rectangle whose front lies ahead of the TCP [m]."""
+    hand_front: tuple[float, float]
+    """How far the fingertips reach beyond the TCP, along the hand's axis and across it, in the vertical plane [m]."""
+    arm_half_width: float
+    """Half the width of the arm between chassis and TCP [m]."""
+
+
+@dataclass(frozen=True)
+class HandLinearization:
+    """The hand about a joint position, in the base frame (on the ground below the base's centre)."""
+
+    tcp: torch.Tensor
+    """TCP's position [m], shape ``[N, 3]``."""
+    rotation: torch.Tensor
+    """Hand's rotation matrix, its axis in the third column, shape ``[N, 3, 3]``."""
+    jacobian: torch.Tensor
+    """Jacobian of the TCP's linear, then angular velocity [m/rad, 1], shape ``[N, 6, 7]``."""
+    reference: torch.Tensor
+    """Arm joints at which this holds [rad], shape ``[N, 7]``."""
+
+
+class TorqueLaw(Protocol):
+    """What computes joint torques; see :class:`cura_torchrl.envs.robots.controller.ImpedanceController`."""
+
+    ik_ticks: int
+    hand: HandLinearization
+
+    def solve_ik(self) -> None:
+        """Plan the next ``ik_ticks`` ticks for all worlds."""
+        ...
+
+    def torques(self, rows: slice, position: Any, velocity: Any) -> Any:
+        """Return joint torques ``[B, J]`` of some worlds from joint positions and velocities of the same shape."""
+        ...

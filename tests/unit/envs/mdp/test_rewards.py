@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from cura_torchrl.envs.config import RewardConfig
-from cura_torchrl.envs.mdp import geometry, rewards
+from cura_torchrl.envs import geometry
+from cura_torchrl.envs.mdp import rewards
 
 CONFIG = RewardConfig()
 

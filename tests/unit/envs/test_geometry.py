@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from cura_torchrl.envs.mdp import geometry
+from cura_torchrl.envs import geometry
 
 
 def _f64(*values: object) -> torch.Tensor:
