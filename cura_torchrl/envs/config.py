@@ -13,6 +13,7 @@ from typing import Literal
 
 ScenarioKind = Literal["uniform", "adversarial", "mixed"]
 Stream = Literal["train", "eval", "vae"]
+Simulator = Literal["bullet", "planar"]
 
 
 def require(condition: bool, what: str, value: object, accepted: str) -> None:
@@ -312,14 +313,20 @@ class PhysicsConfig:
     """Bullet's friction of the robot's links; Bullet multiplies it by the object's [1]."""
     solver_iterations: int = 50
     """Bullet's constraint solver iterations per tick [1]."""
-    planar_sweeps: int = 4
+    planar_period: float = 0.01
+    """Time step of control and physics in the planar simulator [s]; at half the rate its paths are the same."""
+    planar_sweeps: int = 3
     """Gauss-Seidel sweeps over the planar simulator's contacts per tick [1]."""
     planar_correction: float = 0.2
     """Share of an overlap that the planar simulator takes back in a tick; Bullet's default [1]."""
+    planar_creep: float = 0.0165
+    """Slip of a sticking hand in the planar simulator, per force ratio and friction squared; fits Bullet's [m/s]."""
 
     def __post_init__(self) -> None:
         require_finite(self)
-        require(self.control_period > 0, "control_period", self.control_period, "a positive time [s]")
+        for name in ("control_period", "planar_period"):
+            require(getattr(self, name) > 0, name, getattr(self, name), "a positive time [s]")
+        require(self.planar_sweeps >= 1, "planar_sweeps", self.planar_sweeps, "1 or more")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -334,10 +341,11 @@ class PushEnvConfig:
     """Range sensor."""
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     """Clock and contact."""
-    simulator: Literal["bullet"] = "bullet"
-    """Which simulator runs the worlds."""
+    simulator: Simulator = "bullet"
+    """Which simulator runs the worlds: PyBullet, the reference; or tensors in the plane, for speed."""
 
     def __post_init__(self) -> None:
-        period = self.physics.control_period
-        ticks = self.task.policy_period / period
-        require(abs(ticks - round(ticks)) < 1e-6, "control_period", period, "a divisor of policy_period")
+        for name in ("control_period", "planar_period"):
+            period = getattr(self.physics, name)
+            ticks = self.task.policy_period / period
+            require(abs(ticks - round(ticks)) < 1e-6, name, period, "a divisor of policy_period")

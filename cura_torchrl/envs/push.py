@@ -18,9 +18,12 @@ from cura_torchrl.envs.mdp.rewards import REWARD_TERM_NAMES, reward_terms
 from cura_torchrl.envs.mdp.terminations import endings, latch_success, success_flags
 from cura_torchrl.envs.robots import ridgeback_franka as model
 from cura_torchrl.envs.robots.controller import ImpedanceController
+from cura_torchrl.envs.robots.dynamics import RobotDynamics
 from cura_torchrl.envs.sensors.lidar import Lidar
+from cura_torchrl.envs.sensors.noise import noise_key
 from cura_torchrl.envs.simulation.bullet import BulletWorlds
-from cura_torchrl.envs.simulation.interface import SceneState, WorldState
+from cura_torchrl.envs.simulation.interface import SceneState, Worlds, WorldState
+from cura_torchrl.envs.simulation.planar import PlanarWorlds
 
 ACTION_SIZE = 6
 
@@ -36,7 +39,7 @@ class PushEnv(EnvBase):
         num_envs: Number of worlds N.
         config: Task, robot, LiDAR, physics.
         seed: Seed of the scenarios and of the LiDAR's noise.
-        device: Device of the tensordicts; None casts nothing.
+        device: Device of the tensordicts, and of the planar simulator; None casts nothing.
         first_episode: Scenario of row 0's first episode.
         episode_stride: Step from one scenario of a row to its next; N when None.
         frames_done: Frames played before, which the curriculum goes on from.
@@ -73,15 +76,27 @@ class PushEnv(EnvBase):
         self.frames_done = frames_done
         self._frames_per_step = num_envs if frames_per_step is None else frames_per_step
         self._stride = num_envs if episode_stride is None else episode_stride
-        self._next_episode = torch.arange(num_envs) + first_episode
-        self._is_first = torch.ones(num_envs, dtype=torch.bool)
-        self._ticks = round(self.config.task.policy_period / self.config.physics.control_period)
+        is_planar = self.config.simulator == "planar"
+        # Where the worlds live: PyBullet's on the CPU, whatever the device of the tensordicts.
+        self._home = torch.device("cpu") if self.device is None or not is_planar else self.device
+        self._next_episode = torch.arange(num_envs, device=self._home) + first_episode
+        self._is_first = torch.ones(num_envs, dtype=torch.bool, device=self._home)
         self._make_specs()
-        self._worlds = BulletWorlds(num_envs, model.URDF, model.BASE_JOINTS + model.ARM_JOINTS, self.config.physics)
-        self._controller = ImpedanceController(num_envs, self.config.robot, self.config.physics, self._ticks)
-        self._lidar = Lidar(num_envs, self.config.lidar, self._worlds.cast)
+        self._worlds, self._controller = self._make_worlds()
+        self._lidar = Lidar(num_envs, self.config.lidar, self._worlds.cast, self._home)
         self._make_buffers()
         self.set_seed(seed)
+
+    def _make_worlds(self) -> tuple[Worlds, ImpedanceController]:
+        config, rows = self.config, self.num_envs
+        if config.simulator == "planar":
+            period = config.physics.planar_period
+            controller = ImpedanceController(rows, config.robot, period, device=self._home)
+            worlds = PlanarWorlds(rows, RobotDynamics(self._home), model.SHAPE, config.physics, self._home)
+            return worlds, controller
+        joints = model.BASE_JOINTS + model.ARM_JOINTS
+        controller = ImpedanceController(rows, config.robot, config.physics.control_period)
+        return BulletWorlds(rows, model.URDF, joints, config.physics), controller
 
     def _make_specs(self) -> None:
         rows, rays = self.num_envs, self.config.lidar.num_rays
@@ -119,22 +134,21 @@ class PushEnv(EnvBase):
 
     def _make_buffers(self) -> None:
         rows, slots = self.num_envs, scenarios.OBSTACLE_SLOTS
-        self._obstacle_active = torch.zeros(rows, slots, dtype=torch.bool)
-        self._obstacle_pose = torch.zeros(rows, slots, 3, dtype=torch.float64)
-        self._elapsed = torch.zeros(rows, dtype=torch.int64)
-        self._age = torch.zeros(rows, dtype=torch.int64)
-        self._since_success = torch.full((rows,), -1, dtype=torch.int64)
-        self._success = torch.zeros(rows, len(self.config.task.tolerances), dtype=torch.bool)
-        self._tipped = torch.zeros(rows, dtype=torch.bool)
-        self._episode = torch.zeros(rows, dtype=torch.int64)
-        self._previous_action = torch.zeros(rows, ACTION_SIZE)
-        self._terms = torch.zeros(rows, len(REWARD_TERM_NAMES))
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+            return torch.zeros(rows, *shape, dtype=dtype, device=self._home)
+
+        self._obstacle_active, self._obstacle_pose = zeros(slots, dtype=torch.bool), zeros(slots, 3)
+        self._elapsed, self._age, self._episode = (zeros(dtype=torch.int64) for _ in range(3))
+        self._since_success = zeros(dtype=torch.int64) - 1
+        self._success, self._tipped = zeros(len(self.config.task.tolerances), dtype=torch.bool), zeros(dtype=torch.bool)
+        self._previous_action = zeros(ACTION_SIZE, dtype=torch.float32)
+        self._terms = zeros(len(REWARD_TERM_NAMES), dtype=torch.float32)
         self._state: WorldState | None = None
-        self._scan = torch.zeros(rows, self.config.lidar.num_rays)
-        self._tcp = torch.zeros(rows, 3, dtype=torch.float64)
-        self._hand_rotation = torch.zeros(rows, 3, 3, dtype=torch.float64)
-        self._jacobian = torch.zeros(rows, 6, 7, dtype=torch.float64)
-        self.scenario = self._sample(torch.arange(rows))
+        self._scan = zeros(self.config.lidar.num_rays, dtype=torch.float32)
+        self._tcp, self._hand_rotation, self._jacobian = zeros(3), zeros(3, 3), zeros(6, 7)
+        self._all_rows = torch.arange(rows, device=self._home)
+        self.scenario = self._sample(self._all_rows)
 
     @property
     def world_state(self) -> WorldState:
@@ -185,8 +199,8 @@ class PushEnv(EnvBase):
             What every row observes now.
         """
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        rows = torch.arange(self.num_envs) if mask is None else mask.reshape(self.num_envs).nonzero().flatten()
-        self._episode[rows] = self._next_episode[rows] if episodes is None else episodes.reshape(-1)[rows]
+        rows = self._all_rows if mask is None else mask.reshape(self.num_envs).nonzero().flatten().to(self._home)
+        self._episode[rows] = self._next_episode[rows] if episodes is None else episodes.reshape(-1).to(rows)[rows]
         self._next_episode[rows] = self._episode[rows] + self._stride
         self.scenario[rows] = self._sample(self._episode[rows])
         self._clear(rows)
@@ -220,7 +234,7 @@ class PushEnv(EnvBase):
     def _build(self, rows: torch.Tensor) -> None:
         scene = self.scenario[rows]
         task, edge = self.config.task.scenario, scene["object_edge"]
-        arm = torch.tensor(model.HOME, dtype=torch.float64).expand(len(rows), -1)
+        arm = edge.new_tensor(model.HOME).expand(len(rows), -1)
         start = SceneState(
             joint_position=torch.cat([scene["robot_pose"], arm], dim=-1),
             object_edge=edge,
@@ -233,9 +247,8 @@ class PushEnv(EnvBase):
         self._worlds.reset(rows, start)
         # Pushing higher than (edge / 2 - CoM shift) / mu would tip the object; 0.9 is the margin.
         self._controller.reset(rows, 0.9 * edge * (0.5 - task.com_shift) / task.floor_friction[1])
-        seed = self._scenario_seed & 0xFFFFFFFFFFFFFFFF
         stream = ("train", "eval", "vae").index(self.config.task.stream)
-        self._lidar.reset(rows.tolist(), [(stream, seed, int(self._episode[row])) for row in rows])
+        self._lidar.reset(rows, noise_key(stream, self._scenario_seed, self._episode[rows]))
 
     def _read(self) -> None:
         """Read the state of all worlds, and where it puts the TCP."""
@@ -245,7 +258,7 @@ class PushEnv(EnvBase):
     def _spawn(self) -> None:
         """Let obstacles appear whose time has come."""
         time = self._elapsed.double() * self.config.task.policy_period
-        slots = torch.arange(scenarios.OBSTACLE_SLOTS)
+        slots = torch.arange(scenarios.OBSTACLE_SLOTS, device=self._home)
         due = (slots < self.scenario["num_obstacles"][:, None]) & (self.scenario["obstacle_time"] <= time[:, None])
         if not bool((due & ~self._obstacle_active).any()):
             return
@@ -255,9 +268,7 @@ class PushEnv(EnvBase):
             time=time, base_pose=state.base_pose,
             tcp_position=geometry.from_frame(state.base_pose, tcp[:, :2]), object_pose=_planar(state),
         )  # fmt: skip
-        for row, slot in (active & ~self._obstacle_active).nonzero().tolist():
-            x, y, yaw = pose[row, slot].tolist()
-            self._worlds.place_obstacle(row, slot, (x, y, yaw), self.scenario["obstacle_edge"][row, slot].item())
+        self._worlds.place_obstacles(active & ~self._obstacle_active, pose, self.scenario["obstacle_edge"])
         self._obstacle_active, self._obstacle_pose = active, pose
 
     def _measure(self, rows: torch.Tensor) -> None:
@@ -269,11 +280,11 @@ class PushEnv(EnvBase):
         edges = torch.cat([edge, object_edge if self.config.lidar.occlusion else torch.zeros_like(object_edge)], dim=1)
         # A fresh tensor: what was emitted before must not change.
         scan = self._scan.clone()
-        scan[rows] = self._lidar.scan(rows.tolist(), state.base_pose[rows], bodies[rows], edges[rows])
+        scan[rows] = self._lidar.scan(rows, state.base_pose[rows], bodies[rows], edges[rows])
         self._scan = scan
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = tensordict[keys.ACTION].detach().cpu().clamp(-1.0, 1.0)
+        action = tensordict[keys.ACTION].detach().to(self._home).clamp(-1.0, 1.0)
         finite = action.isfinite().all(-1)
         if not bool(finite.all()):
             rows = (~finite).nonzero().flatten().tolist()
@@ -282,12 +293,12 @@ class PushEnv(EnvBase):
         before = self.world_state
         to_object = geometry.to_frame(before.base_pose, before.object_position[:, :2])
         self._controller.command(action, to_object, self._worlds.mass_matrix())
-        self._worlds.advance(self._controller, self._ticks)
+        self._worlds.advance(self._controller, round(self.config.task.policy_period / self._controller.period))
         self.frames_done += self._frames_per_step
         self._elapsed = self._elapsed + 1
         self._read()
         self._spawn()
-        self._measure(torch.arange(self.num_envs))
+        self._measure(self._all_rows)
         cost, reward = self._judge(action, before)
         terminated, truncated = endings(
             self.config.task,

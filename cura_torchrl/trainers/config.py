@@ -11,11 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from cura_torchrl.envs.config import MapConfig, PushEnvConfig, ScenarioKind, require, require_finite
+from cura_torchrl.envs.config import MapConfig, PushEnvConfig, ScenarioKind, Simulator, require, require_finite
 from cura_torchrl.trainers.decoding import decode, encode
 
 LoggerKind = Literal["csv", "tensorboard", "wandb"]
-Simulator = Literal["bullet"]
 ScriptedKind = Literal["scripted", "avoider", "random"]
 Perception = Literal["map", "none", "privileged"]
 
@@ -152,7 +151,7 @@ class TrainConfig:
     method: str = "cura-ppo"
     """Which preset the other values start from."""
     simulator: Simulator = "bullet"
-    """Which simulator runs the worlds."""
+    """Which simulator runs the worlds; ``env.simulator`` follows it."""
     num_envs: int = 64
     """Environments over all workers together [1]."""
     num_workers: int = 1
@@ -214,9 +213,7 @@ class TrainConfig:
             self.checkpoint_minutes,
             "a time that is not negative [min]",
         )
-        require(
-            self.env.simulator == self.simulator, "env.simulator", self.env.simulator, f"simulator {self.simulator!r}"
-        )
+        object.__setattr__(self, "env", dataclasses.replace(self.env, simulator=self.simulator))
 
     @property
     def frames_per_batch(self) -> int:

@@ -21,7 +21,7 @@ from cura_torchrl.envs.simulation.interface import HandLinearization
 if TYPE_CHECKING:
     from typing import TypeAlias
 
-    from cura_torchrl.envs.config import PhysicsConfig, RobotConfig
+    from cura_torchrl.envs.config import RobotConfig
 
 Array: TypeAlias = Any
 """A NumPy array or a tensor, float64; of one kind throughout a controller."""
@@ -35,8 +35,7 @@ class ImpedanceController:
     Args:
         num_worlds: Number of robots N.
         robot: Limits and gains.
-        physics: Clock.
-        ticks: Control ticks in a policy step.
+        period: Time between two ticks [s].
         device: Where the law's tensors live; NumPy arrays when None.
     """
 
@@ -44,15 +43,13 @@ class ImpedanceController:
         self,
         num_worlds: int,
         robot: RobotConfig,
-        physics: PhysicsConfig,
-        ticks: int,
+        period: float,
         device: torch.device | None = None,
     ) -> None:
         self.config = robot
         self.kinematics = ArmKinematics(device)
-        self.period = physics.control_period
+        self.period = period
         self.ik_ticks = max(1, round(1.0 / (robot.ik_rate * self.period)))
-        self.ticks = ticks
         self._is_tensor = device is not None
         self._xp: Any = torch if self._is_tensor else np
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from cura_torchrl.envs.simulation.interface import RobotShape
+
 URDF = Path(__file__).parent / "assets" / "ridgeback_franka.urdf"
 """The model. Both PyBullet and pytorch-kinematics read this file."""
 
@@ -49,3 +51,13 @@ Static pushing force within the torque limits there: 108 N (J^T), against at mos
 
 HOME_TCP = (0.9, 0.0, 0.28)
 """TCP at :data:`HOME`, base frame [m]."""
+
+SHAPE = RobotShape(
+    chassis_size=CHASSIS_SIZE,
+    chassis_height=0.18,
+    hand_size=(0.12, 0.122),
+    hand_front=(0.0074, 0.0105),
+    arm_half_width=0.1,
+)
+"""The robot seen from above. The chassis' box in the URDF spans 0.056 to 0.306 m above the ground; the hand is as wide
+as its two open fingers, whose tips are 21 mm thick and end 7.4 mm beyond the TCP."""

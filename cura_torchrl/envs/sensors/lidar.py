@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 
 from cura_torchrl.envs import geometry
+from cura_torchrl.envs.sensors import noise
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from cura_torchrl.envs.config import LidarConfig
 
 
-def ray_angles(num_rays: int) -> torch.Tensor:
+def ray_angles(num_rays: int, device: torch.device | None = None) -> torch.Tensor:
     """Return the rays' directions in the base frame, from behind, counter-clockwise [rad], shape ``[R]``.
 
     Examples:
         >>> ray_angles(4).div(math.pi).tolist()
         [-1.0, -0.5, 0.0, 0.5]
     """
-    return torch.arange(num_rays, dtype=torch.float64) * (2 * math.pi / num_rays) - math.pi
+    return torch.arange(num_rays, dtype=torch.float64, device=device) * (2 * math.pi / num_rays) - math.pi
 
 
 def ray_ends(pose: torch.Tensor, config: LidarConfig) -> torch.Tensor:
@@ -39,7 +39,7 @@ def ray_ends(pose: torch.Tensor, config: LidarConfig) -> torch.Tensor:
     Returns:
         End points in the world frame [m], shape ``[B, R, 3]``.
     """
-    angle = (ray_angles(config.num_rays) + pose[:, 2:3]).contiguous()
+    angle = (ray_angles(config.num_rays, pose.device) + pose[:, 2:3]).contiguous()
     x = pose[:, 0:1] + config.max_range * angle.cos()
     y = pose[:, 1:2] + config.max_range * angle.sin()
     return torch.stack([x, y, torch.full_like(x, config.height)], dim=-1)
@@ -66,26 +66,39 @@ class Lidar:
     Args:
         num_worlds: Number of sensors N.
         config: Pattern, range, noise, occlusion.
-        cast: Casts rays from ``[B, 3]`` to ``[B, R, 3]`` in the named worlds and returns free shares ``[B, R]``.
+        cast: Casts rays in worlds ``[B]`` from ``[B, 3]`` to ``[B, R, 3]`` and returns free shares ``[B, R]``.
+        device: Where the tensors live.
     """
 
-    def __init__(self, num_worlds: int, config: LidarConfig, cast: Callable[..., np.ndarray]) -> None:
+    def __init__(
+        self,
+        num_worlds: int,
+        config: LidarConfig,
+        cast: Callable[..., torch.Tensor],
+        device: torch.device | None = None,
+    ) -> None:
         self.config = config
         self._cast = cast
-        self._noise = [np.random.default_rng(0) for _ in range(num_worlds)]
+        self._key = torch.zeros(num_worlds, dtype=torch.int64, device=device)
+        self._scans = torch.zeros_like(self._key)
 
-    def reset(self, rows: list[int], keys: list[tuple[int, ...]]) -> None:
-        """Start each world's noise anew from a key of non-negative integers."""
-        for row, key in zip(rows, keys, strict=True):
-            self._noise[row] = np.random.Generator(np.random.Philox(np.random.SeedSequence(key)))
+    def reset(self, rows: torch.Tensor, key: torch.Tensor) -> None:
+        """Start the noise of worlds anew.
+
+        Args:
+            rows: Their indices, shape ``[B]``.
+            key: Keys as from :func:`cura_torchrl.envs.sensors.noise.noise_key`, shape ``[B]``.
+        """
+        self._key[rows] = key
+        self._scans[rows] = 0
 
     def scan(
-        self, rows: list[int], pose: torch.Tensor, body_pose: torch.Tensor, body_edge: torch.Tensor
+        self, rows: torch.Tensor, pose: torch.Tensor, body_pose: torch.Tensor, body_edge: torch.Tensor
     ) -> torch.Tensor:
         """Measure.
 
         Args:
-            rows: Worlds to measure in, B of them.
+            rows: Worlds to measure in, shape ``[B]``.
             pose: Sensor (x [m], y [m], yaw [rad]), shape ``[B, 3]``.
             body_pose: Bodies that rays must see, (x [m], y [m], yaw [rad]), shape ``[B, M, 3]``.
             body_edge: Their edges [m], 0 where there is none, shape ``[B, M]``.
@@ -98,14 +111,14 @@ class Lidar:
         """
         inside = starts_inside(pose, body_pose, body_edge)
         if bool(inside.any()):
-            worlds = [rows[i] for i in inside.nonzero().flatten().tolist()]
-            msg = f"the LiDAR of worlds {worlds} starts inside a body, where rays would read free space"
+            msg = f"the LiDAR of worlds {rows[inside].tolist()} starts inside a body, where rays would read free space"
             raise RuntimeError(msg)
-        origin = torch.cat([pose[:, :2], torch.full_like(pose[:, :1], self.config.height)], dim=-1).numpy()
-        free = self._cast(origin, ray_ends(pose, self.config).numpy(), see_object=self.config.occlusion, rows=rows)
+        origin = torch.cat([pose[:, :2], torch.full_like(pose[:, :1], self.config.height)], dim=-1)
+        free = self._cast(rows, origin, ray_ends(pose, self.config), see_object=self.config.occlusion)
         ranges = free * self.config.max_range
         if self.config.noise > 0:
-            draws = np.stack([self._noise[row].standard_normal(self.config.num_rays) for row in rows])
-            noisy = np.clip(ranges + self.config.noise * draws, 0.0, self.config.max_range)
-            ranges = np.where(free < 1.0, noisy, ranges)
-        return torch.from_numpy(ranges.astype(np.float32))
+            draws = noise.normal(self._key[rows], self._scans[rows], self.config.num_rays)
+            noisy = (ranges + self.config.noise * draws).clamp(0.0, self.config.max_range)
+            ranges = torch.where(free < 1.0, noisy, ranges)
+        self._scans[rows] += 1
+        return ranges.float()

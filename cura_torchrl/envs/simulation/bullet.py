@@ -158,15 +158,18 @@ class BulletWorlds:
         self._com_offset[world] = offset
         return body
 
-    def place_obstacle(self, world: int, slot: int, pose: tuple[float, float, float], edge: float) -> None:
-        """Let a static cube appear on the floor.
+    def place_obstacles(self, is_new: torch.Tensor, pose: torch.Tensor, edge: torch.Tensor) -> None:
+        """Let static cubes appear on the floor.
 
         Args:
-            world: Index of the world.
-            slot: Index of the obstacle.
-            pose: Centre (x [m], y [m], yaw [rad]) in the world frame.
-            edge: Edge length [m].
+            is_new: Which obstacles appear now, bool, shape ``[N, M]``.
+            pose: Their centres (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, M, 3]``.
+            edge: Their edges [m], shape ``[N, M]``.
         """
+        for world, slot in is_new.nonzero().tolist():
+            self._place(world, slot, pose[world, slot].tolist(), edge[world, slot].item())
+
+    def _place(self, world: int, slot: int, pose: list[float], edge: float) -> None:
         client, (x, y, yaw) = self._clients[world], pose
         shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=[edge / 2] * 3, physicsClientId=client)
         body = bullet.createMultiBody(
@@ -274,16 +277,14 @@ class BulletWorlds:
             contact=torch.from_numpy(self._contact.copy()),
         )
 
-    def cast(
-        self, origin: np.ndarray, ends: np.ndarray, *, see_object: bool, rows: list[int] | None = None
-    ) -> np.ndarray:
+    def cast(self, rows: torch.Tensor, origin: torch.Tensor, ends: torch.Tensor, *, see_object: bool) -> torch.Tensor:
         """Cast rays, one call per world. Rays never see the robot.
 
         Args:
+            rows: Indices of the worlds, shape ``[B]``.
             origin: Where the rays start, world frame [m], shape ``[B, 3]``.
             ends: Where they end, world frame [m], shape ``[B, R, 3]``.
             see_object: Whether rays hit the pushed object.
-            rows: Indices of the worlds; all when left out.
 
         Returns:
             Share of the ray that is free [1], 1 for a miss, shape ``[B, R]``.
@@ -292,21 +293,21 @@ class BulletWorlds:
             SimulationError: If a ray is not finite, or Bullet does not answer every ray.
         """
         num_rays = ends.shape[1]
-        if num_rays > _MAX_RAYS or not (np.isfinite(origin).all() and np.isfinite(ends).all()):
-            finite = bool(np.isfinite(origin).all() and np.isfinite(ends).all())
+        finite = bool(origin.isfinite().all() and ends.isfinite().all())
+        if num_rays > _MAX_RAYS or not finite:
             msg = f"{num_rays} rays, finite: {finite}; accepted: at most {_MAX_RAYS} finite rays a world"
             raise SimulationError(msg)
         mask = OBSTACLE | (OBJECT if see_object else 0)
         fractions = np.empty(ends.shape[:2])
-        starts = np.ascontiguousarray(np.broadcast_to(origin[:, None], ends.shape))
-        for row, world in enumerate(range(self.num_worlds) if rows is None else rows):
+        starts, targets = origin[:, None].expand(ends.shape).contiguous().numpy(), ends.numpy()
+        for row, world in enumerate(rows.tolist()):
             client = self._clients[world]
-            hits = bullet.rayTestBatch(starts[row], ends[row], collisionFilterMask=mask, physicsClientId=client)
+            hits = bullet.rayTestBatch(starts[row], targets[row], collisionFilterMask=mask, physicsClientId=client)
             if len(hits) != num_rays:
                 msg = f"Bullet answered {len(hits)} of {num_rays} rays in world {world}"
                 raise SimulationError(msg)
             fractions[row] = [hit[2] for hit in hits]
-        return fractions
+        return torch.from_numpy(fractions)
 
 
 def _rotate(quaternion: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:

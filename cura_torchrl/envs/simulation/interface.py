@@ -99,3 +99,35 @@ class TorqueLaw(Protocol):
     def torques(self, rows: slice, position: Any, velocity: Any) -> Any:
         """Return joint torques ``[B, J]`` of some worlds from joint positions and velocities of the same shape."""
         ...
+
+
+class Worlds(Protocol):
+    """N worlds that the task runs in. Arrays and tensors are of the kind that the control law works with."""
+
+    def reset(self, rows: torch.Tensor, scene: SceneState) -> None:
+        """Put the worlds ``rows`` at their start."""
+        ...
+
+    def place_obstacles(self, is_new: torch.Tensor, pose: torch.Tensor, edge: torch.Tensor) -> None:
+        """Let static cubes appear: which ``[N, M]``, where ``[N, M, 3]``, their edges [m] ``[N, M]``."""
+        ...
+
+    def mass_matrix(self) -> Any:
+        """Return the joint-space inertia ``[N, J, J]``."""
+        ...
+
+    def advance(self, law: TorqueLaw, ticks: int) -> None:
+        """Run control and physics for some ticks."""
+        ...
+
+    def state(self) -> WorldState:
+        """Return the state, batch ``[N]``."""
+        ...
+
+    def cast(self, rows: torch.Tensor, origin: torch.Tensor, ends: torch.Tensor, *, see_object: bool) -> torch.Tensor:
+        """Return the free share ``[B, R]`` of rays from ``[B, 3]`` to ``[B, R, 3]`` in the worlds ``rows``."""
+        ...
+
+    def close(self) -> None:
+        """Release what the simulator holds; harmless when done twice."""
+        ...

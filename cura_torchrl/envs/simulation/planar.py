@@ -14,13 +14,11 @@ from cura_torchrl.envs import geometry
 from cura_torchrl.envs.simulation.contact import Rectangle, overlap
 from cura_torchrl.envs.simulation.interface import SimulationError, WorldState
 from cura_torchrl.envs.simulation.pushing import Cube, Pushers, PushContact
+from cura_torchrl.envs.simulation.rays import free_share
 
 if TYPE_CHECKING:
     from cura_torchrl.envs.config import PhysicsConfig
     from cura_torchrl.envs.simulation.interface import HandLinearization, RobotShape, SceneState, TorqueLaw
-
-_RAY_CHUNK = 2**18
-"""Ray-body pairs handled together: keeps them in the cache."""
 
 
 class Dynamics(Protocol):
@@ -51,18 +49,20 @@ class PlanarWorlds:
         device: torch.device | None = None,
     ) -> None:
         self.num_worlds = num_worlds
-        self._dynamics, self._shape, self._period = dynamics, shape, physics.control_period
+        self._dynamics, self._shape, self._period = dynamics, shape, physics.planar_period
         self._device = device
 
         def zeros(*size: int) -> torch.Tensor:
             return torch.zeros(num_worlds, *size, dtype=torch.float64, device=device)
 
         self._position, self._velocity = zeros(10), zeros(10)
+        self._inertia = torch.eye(10, dtype=torch.float64, device=device).expand(num_worlds, 10, 10)
         self._inverse_inertia = zeros(10, 10)
         self._cube = Cube(zeros(3), zeros(3), zeros() + 1.0, zeros() + 1.0, zeros() + 1.0, zeros(3))
         self._pushing = PushContact(
             num_worlds, 2, period=self._period, gravity=physics.gravity, pusher_friction=physics.hand_friction,
-            sweeps=physics.planar_sweeps, correction=physics.planar_correction, device=device,
+            sweeps=physics.planar_sweeps, correction=physics.planar_correction,
+            creep=physics.planar_creep, device=device,
         )  # fmt: skip
         self._half = torch.tensor([shape.hand_size, shape.chassis_size], dtype=torch.float64, device=device) / 2
         self._obstacle_pose, self._obstacle_edge = zeros(0, 3), zeros(0)
@@ -114,8 +114,12 @@ class PlanarWorlds:
         self._obstacle_edge = torch.where(is_new, edge, self._obstacle_edge)
 
     def mass_matrix(self) -> torch.Tensor:
-        """Return the joint-space inertia of every robot [kg, kg m^2], shape ``[N, J, J]``."""
-        return self._dynamics.mass_matrix(self._position)
+        """Return the joint-space inertia of every robot [kg, kg m^2], shape ``[N, J, J]``.
+
+        The ticks after it move the robots with this inertia: it changes little within a policy step.
+        """
+        self._inertia = self._dynamics.mass_matrix(self._position)
+        return self._inertia
 
     def advance(self, law: TorqueLaw, ticks: int) -> None:
         """Run control and physics of one policy step.
@@ -128,8 +132,7 @@ class PlanarWorlds:
             SimulationError: If a state is not finite.
         """
         self._contact = torch.zeros_like(self._contact)
-        # As PyBullet does in its ticks, but once a policy step: the inertia changes little in between.
-        self._inverse_inertia = torch.linalg.inv(self.mass_matrix())
+        self._inverse_inertia = torch.linalg.inv(self._inertia)
         for start in range(0, ticks, law.ik_ticks):
             law.solve_ik()
             self._linearize(law.hand)
@@ -218,6 +221,30 @@ class PlanarWorlds:
             _rectangle(self._obstacle_pose, obstacle_half, obstacle_half),
         )
         self._contact = self._contact | (touches & (self._obstacle_edge > 0)).any(-1).T
+
+    def cast(self, rows: torch.Tensor, origin: torch.Tensor, ends: torch.Tensor, *, see_object: bool) -> torch.Tensor:
+        """Cast rays against the squares that cube and obstacles are seen from above. Rays never see the robot.
+
+        Args:
+            rows: Indices of the worlds, shape ``[B]``.
+            origin: Where the rays start, world frame [m], shape ``[B, 3]``.
+            ends: Where they end, world frame [m], shape ``[B, R, 3]``.
+            see_object: Whether rays hit the pushed object.
+
+        Returns:
+            Share of the ray that is free [1], 1 for a miss, shape ``[B, R]``.
+
+        Raises:
+            SimulationError: If a ray is not finite.
+        """
+        if not bool(origin.isfinite().all() & ends.isfinite().all()):
+            msg = "rays that are not finite; accepted: finite rays"
+            raise SimulationError(msg)
+        pose, edge = self._obstacle_pose[rows], self._obstacle_edge[rows]
+        if see_object:
+            pose = torch.cat([pose, self._cube_pose()[rows, None]], dim=1)
+            edge = torch.cat([edge, self._cube.edge[rows, None]], dim=1)
+        return free_share(origin[:, :2], ends[..., :2], pose, edge / 2)
 
     def _cube_pose(self) -> torch.Tensor:
         cube = self._cube

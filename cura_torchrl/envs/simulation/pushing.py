@@ -80,6 +80,7 @@ class PushContact:
         pusher_friction: Friction of the pushers, multiplied by the cube's as Bullet does [1].
         sweeps: Gauss-Seidel sweeps a tick.
         correction: Share of an overlap that is taken back in a tick [1].
+        creep: Slip speed of a pusher that sticks, for tangential force over normal force over friction squared [m/s].
         device: Where the tensors live.
 
     Source:
@@ -97,10 +98,11 @@ class PushContact:
         pusher_friction: float,
         sweeps: int,
         correction: float,
+        creep: float,
         device: torch.device | None = None,
     ) -> None:
         self._period, self._gravity, self._pusher_friction = period, gravity, pusher_friction
-        self._sweeps, self._correction = sweeps, correction
+        self._sweeps, self._correction, self._creep = sweeps, correction, creep
 
         def zeros(*shape: int) -> torch.Tensor:
             return torch.zeros(*shape, num_worlds, dtype=torch.float64, device=device)
@@ -133,7 +135,10 @@ class PushContact:
         """
         footprint = _Footprint(cube, self._signs)
         floor = _Floor(cube, footprint, cube.friction * self._load * self._period)
-        touch = _Touch(cube, footprint, pushers, self._pusher_friction * cube.friction, self._correction / self._period)
+        touch = _Touch(
+            cube, footprint, pushers, self._pusher_friction * cube.friction,
+            correction_rate=self._correction / self._period, creep=self._creep,
+        )  # fmt: skip
         touch.allow(self._period)
         twist, pusher_twist = cube.twist.T.contiguous(), pushers.twist
         twist = floor.push(twist, self._floor_impulse)
@@ -206,7 +211,14 @@ class _Touch:
     """Contact of the pushers with the cube in one tick. Impulses at a point ``[3, B, N]``: normal, left, up."""
 
     def __init__(
-        self, cube: Cube, footprint: _Footprint, pushers: Pushers, friction: torch.Tensor, correction_rate: float
+        self,
+        cube: Cube,
+        footprint: _Footprint,
+        pushers: Pushers,
+        friction: torch.Tensor,
+        *,
+        correction_rate: float,
+        creep: float,
     ) -> None:
         rectangle = footprint.rectangle
         self._contact = contact = rectangle_manifold(pushers.rectangle, _expanded(rectangle, pushers.height))
@@ -221,7 +233,8 @@ class _Touch:
         sharing = (contact.gap < _TOUCHING).any(0).sum(0).clamp_min(1)
         along = self._answer(self._x, self._y, sharing)
         beside = torch.maximum(self._answer(-self._y, self._x, sharing), pushers.mobility[2, 2])
-        self._normal_step, self._tangent_step = 1 / along, 1 / beside
+        self._normal_step, self._tangent_weight = 1 / along, beside
+        self._creep = creep / friction**2
 
     def _answer(self, x: torch.Tensor, y: torch.Tensor, sharing: torch.Tensor) -> torch.Tensor:
         """Return the change of relative velocity along a direction for an impulse along it [1/kg], ``[2, B, N]``."""
@@ -245,9 +258,11 @@ class _Touch:
         opening = rate_x * self._x + rate_y * self._y
         normal = impulse[0] + (self._least_rate[point] - opening) * self._normal_step[point]
         normal = normal.clamp_min(0.0)
-        step = self._tangent_step[point]
-        left = impulse[1] - (rate_y * self._x - rate_x * self._y) * step
-        up = impulse[2] + pusher_twist[2] * step
+        # Creep: sticking contacts slip at a speed that grows with their load.
+        softness = self._creep / normal.clamp_min(_TINY)
+        step = 1 / (self._tangent_weight[point] + softness)
+        left = impulse[1] - (rate_y * self._x - rate_x * self._y + softness * impulse[1]) * step
+        up = impulse[2] + (pusher_twist[2] - softness * impulse[2]) * step
         scale = (self._friction * normal / torch.hypot(left, up).clamp_min(_TINY)).clamp_max(1.0)
         return torch.stack([normal, left * scale, up * scale])
 
