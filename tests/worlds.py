@@ -14,8 +14,7 @@ from cura_torchrl.envs.simulation.bullet import BulletWorlds
 from cura_torchrl.envs.simulation.interface import SceneState
 
 if TYPE_CHECKING:
-    from cura_torchrl.envs.simulation.bullet import TorqueLaw
-    from cura_torchrl.envs.simulation.interface import WorldState
+    from cura_torchrl.envs.simulation.interface import TorqueLaw, Worlds, WorldState
 
 TICKS = 40
 """Control ticks of 5 ms in a policy step."""
@@ -58,6 +57,16 @@ def make_worlds(num_worlds: int = 1, **overrides: Any) -> BulletWorlds:
     return worlds
 
 
+def place(
+    worlds: Worlds, world: int, slot: int, pose: tuple[float, float, float], edge: float, *, num_worlds: int = 1
+) -> None:
+    """Let one static cube appear."""
+    is_new = torch.zeros(num_worlds, 6, dtype=torch.bool)
+    is_new[world, slot] = True
+    values = torch.tensor([*pose, edge], dtype=torch.float64).expand(num_worlds, 6, 4)
+    worlds.place_obstacles(is_new, values[..., :3], values[..., 3])
+
+
 class NoTorque:
     """A law for robots that are left alone."""
 
@@ -97,7 +106,7 @@ class Rig:
     def __init__(self, num_worlds: int = 1, *, height_limit: float = 0.45, **overrides: Any) -> None:
         self.rows = num_worlds
         self.worlds = make_worlds(num_worlds, **overrides)
-        self.controller = ImpedanceController(num_worlds, RobotConfig(), PhysicsConfig(), TICKS)
+        self.controller = ImpedanceController(num_worlds, RobotConfig(), PhysicsConfig().control_period)
         limit = torch.full((num_worlds,), height_limit, dtype=torch.float64)
         self.controller.reset(torch.arange(num_worlds), limit)
         self.record = Recorder(self.controller)

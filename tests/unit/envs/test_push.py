@@ -1,7 +1,8 @@
-"""The pushing environment on PyBullet: TorchRL's contract, and what begins, changes and ends an episode."""
+"""The pushing environment: TorchRL's contract, and what begins, changes and ends an episode."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 from cura_torchrl.envs.config import LidarConfig, PushEnvConfig, ScenarioConfig, TaskConfig
 from cura_torchrl.envs.push import PushEnv
 from tests.contracts.env import LIMIT, EnvContract, assert_same, draw_actions, play
+from tests.worlds import place
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -33,6 +35,14 @@ class TestPushEnv(EnvContract):
     def make_env(self, num_envs: int, *, limit: int = LIMIT, **kwargs: Any) -> PushEnv:
         """Return the environment on PyBullet."""
         return PushEnv(num_envs, make_config(limit), **kwargs)
+
+
+class TestPlanarPushEnv(EnvContract):
+    """The same on the planar simulator."""
+
+    def make_env(self, num_envs: int, *, limit: int = LIMIT, **kwargs: Any) -> PushEnv:
+        """Return the environment on tensors."""
+        return PushEnv(num_envs, dataclasses.replace(make_config(limit), simulator="planar"), **kwargs)
 
 
 @pytest.fixture
@@ -123,7 +133,7 @@ def test_a_success_in_the_step_of_a_collision_does_not_count(make):
     root = env.reset(episodes=torch.tensor([2]))
     # The object is at the goal from the start, and would succeed in the first step: make that the collision's.
     worlds, (_, pose, edge) = env._worlds, env.obstacles
-    worlds.place_obstacle(0, 5, (0.3, 0.0, pose[0, 0, 2].item()), edge[0, 0].item())
+    place(worlds, 0, 5, (0.3, 0.0, pose[0, 0, 2].item()), edge[0, 0].item())
     after = env.step(root.set("action", torch.zeros(1, 6)))["next"]
     assert after["contact"].tolist() == [[False, False, True]]
     assert not after["success"].any()

@@ -66,7 +66,7 @@ def test_a_configuration_survives_a_json_file(config: TrainConfig) -> None:
         ({"ppo": {"epochs": 5.0}}, "ppo.epochs is 5.0; accepted: a whole number"),
         ({"num_envs": None}, "num_envs is None; accepted: a whole number"),
         ({"num_envs": 3, "num_workers": 2}, "num_envs is 3; accepted: a multiple of num_workers 2"),
-        ({"simulator": "isaac"}, "simulator is 'isaac'; accepted: bullet"),
+        ({"simulator": "isaac"}, "simulator is 'isaac'; accepted: bullet, planar"),
         ({"run_dir": 3}, "run_dir is 3; accepted: a path"),
         ({"network": {"actor_hidden_sizes": 3}}, "network.actor_hidden_sizes is 3; accepted: a list"),
         (

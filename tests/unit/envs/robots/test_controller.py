@@ -20,7 +20,7 @@ IDENTITY = np.eye(10)[None]
 
 def make_controller(rows: int = 1, height_limit: float = 0.45) -> ImpedanceController:
     """Return a controller at home."""
-    controller = ImpedanceController(rows, ROBOT, PHYSICS, TICKS)
+    controller = ImpedanceController(rows, ROBOT, PHYSICS.control_period)
     controller.reset(torch.arange(rows), torch.full((rows,), height_limit, dtype=torch.float64))
     return controller
 
@@ -108,7 +108,7 @@ def test_the_reference_goes_no_further_than_the_torque_reaches():
     reach = np.array(model.TORQUE_LIMIT) / np.array(ROBOT.stiffness)  # 0.145 rad for joint 1
     assert (np.abs(controller.reference[0] - model.HOME) <= reach + 1e-12).all()
     tcp = controller.kinematics.forward(torch.from_numpy(controller.reference))[0].numpy()
-    assert np.abs(controller.tcp_reference - tcp).max() <= ROBOT.tcp_leash + 1e-3
+    assert np.abs(controller.tcp_reference.numpy() - tcp).max() <= ROBOT.tcp_leash + 1e-3
 
 
 @pytest.mark.parametrize("direction", [-1.0, 1.0])
@@ -145,7 +145,7 @@ def test_a_reset_puts_its_rows_alone_at_home():
     """Catches a partial reset that stops or moves other robots."""
     controller = make_controller(2)
     run(controller, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0], steps=2)
-    moved = controller.reference.copy(), controller.base_command.copy(), controller.tcp_reference.copy()
+    moved = controller.reference.copy(), controller.base_command.copy(), controller.tcp_reference.numpy().copy()
     controller.reset(torch.tensor([1]), torch.tensor([0.3], dtype=torch.float64))
     for before, after, home in zip(
         moved,

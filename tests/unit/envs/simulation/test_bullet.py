@@ -9,8 +9,9 @@ import torch
 
 from cura_torchrl.envs.config import PhysicsConfig
 from cura_torchrl.envs.robots import ridgeback_franka as model
-from cura_torchrl.envs.simulation.bullet import BulletWorlds, SimulationError
-from tests.worlds import TICKS, NoTorque, make_scene, make_worlds
+from cura_torchrl.envs.simulation.bullet import BulletWorlds
+from cura_torchrl.envs.simulation.interface import SimulationError
+from tests.worlds import TICKS, NoTorque, make_scene, make_worlds, place
 
 
 class Throw(NoTorque):
@@ -61,7 +62,7 @@ def test_a_reset_touches_its_worlds_alone():
 def test_a_reset_removes_obstacles_and_contacts():
     """Catches what is left over from the last episode."""
     worlds = make_worlds(1)
-    worlds.place_obstacle(0, 0, (0.0, 0.0, 0.0), 0.6)
+    place(worlds, 0, 0, (0.0, 0.0, 0.0), 0.6)
     worlds.advance(NoTorque(), 1)
     assert worlds.state().contact[0, 0]
     worlds.reset(torch.arange(1), make_scene(1))
