@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots.dynamics import RobotDynamics
 from cura_torchrl.envs.robots.kinematics import ArmKinematics
 from tests.worlds import make_worlds
 
@@ -167,3 +168,19 @@ def test_the_simulator_reads_the_same_masses():
     assert total == pytest.approx(model.BASE_MASS, abs=0.01)
     assert inertia[2, 2] == pytest.approx(model.BASE_YAW_INERTIA, rel=0.05)
     np.testing.assert_allclose(inertia, inertia.T, atol=1e-9)
+
+
+def test_the_inertia_is_that_of_pybullet():
+    """Catches a body that is left out, a frame or an axis that is wrong, and base velocities in the base's frame."""
+    client = pybullet.connect(pybullet.DIRECT)
+    # Link by link: merging fixed links, as BulletWorlds does for speed, shifts the hand's centre of mass a little.
+    robot = pybullet.loadURDF(
+        str(model.URDF), useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client
+    )
+    generator = np.random.default_rng(0)
+    position = generator.uniform(-1.0, 1.0, (5, 10))
+    position[:, 3:] += model.HOME
+    expected = [pybullet.calculateMassMatrix(robot, row.tolist(), physicsClientId=client) for row in position]
+    pybullet.disconnect(client)
+    matrix = RobotDynamics().mass_matrix(torch.from_numpy(position))
+    np.testing.assert_allclose(matrix, expected, atol=1e-5)
