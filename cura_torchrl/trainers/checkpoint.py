@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from torchrl.envs import EnvBase
 
-    from cura_torchrl.envs.config import TaskConfig
+    from cura_torchrl.envs.config import Simulator, TaskConfig
 
 logger = logging.getLogger(__name__)
 
@@ -218,13 +218,20 @@ class LoadedPolicy:
     """Where the networks came from."""
 
     def make_env(
-        self, num_envs: int, *, task: TaskConfig | None = None, keep_map: bool = False, **options: Any
+        self,
+        num_envs: int,
+        *,
+        task: TaskConfig | None = None,
+        simulator: Simulator | None = None,
+        keep_map: bool = False,
+        **options: Any,
     ) -> EnvBase:
         """Return the environment that the policy was trained for, on the frozen evaluation scenarios.
 
         Args:
             num_envs: Number of worlds N.
             task: Task to play; None is the trained one with all its obstacles.
+            simulator: Where to play; None is where the policy was trained.
             keep_map: Whether the window of the map stays in the tensordict under ``confidence_map``.
             **options: Keyword arguments of :class:`~cura_torchrl.envs.push.PushEnv`, such as ``seed``.
 
@@ -233,7 +240,9 @@ class LoadedPolicy:
         """
         played = self.config.env.task if task is None else task
         played = dataclasses.replace(played, stream="eval", random_first_age=False, curriculum=())
-        config = self.config.replace(env=dataclasses.replace(self.config.env, task=played))
+        config = self.config.replace(
+            env=dataclasses.replace(self.config.env, task=played), simulator=simulator or self.config.simulator
+        )
         return make_env(config, num_envs, keep_map=keep_map, **options)
 
 

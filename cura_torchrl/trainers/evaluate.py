@@ -242,7 +242,8 @@ def _build(config: EvaluateConfig) -> tuple[EnvBase, Callable[[TensorDictBase], 
     """Return the worlds and who plays in them."""
     if config.policy is None:
         loaded = load_policy(_path(config))
-        env = loaded.make_env(config.chunk, task=_task(loaded.config.env.task, config), seed=config.seed)
+        task = _task(loaded.config.env.task, config)
+        env = loaded.make_env(config.chunk, task=task, simulator=config.simulator, seed=config.seed)
         return env, loaded.policy
     base = PushEnvConfig(simulator=config.simulator)
     task = dataclasses.replace(_task(base.task, config), privileged=config.policy == "avoider")
