@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import os
 import sys
 import time
@@ -287,6 +288,7 @@ def saturation(costs: Costs, config: TrainConfig) -> dict[str, float]:
 
 def main() -> None:
     """Measure, predict, print."""
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs to stdout
     torch.set_num_threads(1)
     torch.manual_seed(0)
     load = os.getloadavg()
