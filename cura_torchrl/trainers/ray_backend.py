@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import logging
 import signal
-import sys
 import threading
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -99,9 +98,9 @@ class RayRollouts:
             NonFiniteError: If a number is not finite.
         """  # noqa: DOC502 - raised by what this calls
         # Three things of torchrl 0.14.1's RayCollector are gone round with its own `map_fn`. Its iterator ends at once
-        # with `total_frames=-1`; it waits for all rollouts before it looks at an error, where `ray.get` of all raises
-        # with the first; and its weights go through gloo, whose processes connect each to each, to an address that is
-        # 127.0.1.1 where /etc/hosts says so. Ray's object store hands them from node to node.
+        # with `total_frames=-1`, its default; it waits for all rollouts before it looks at an error, where `ray.get` of
+        # all raises the first; and its weights go through gloo, whose processes connect each to each, at an address
+        # that is 127.0.1.1 where /etc/hosts says so. Ray's object store needs no connections but its own.
         weights = ray.put(TensorDict.from_module(self._policy).data)
         self._call(self._collector.map_fn, "update_policy_weights_", [(weights,)] * len(self._nodes))
         return torch.cat(self._call(self._collector.map_fn, "next"))
@@ -117,13 +116,13 @@ class RayRollouts:
 
     def _explain(self, error: Exception) -> NodeLostError | WorkerError:
         # Asks every worker: the failed call names one, and a node takes several with it. One that is busy counts as
-        # alive. Ray's list of nodes is no help: it shows a dead one for up to half a minute.
+        # alive. Ray's list of nodes is no help: it shows a dead one until a health check fails.
         pings = [worker.__ray_ready__.remote() for worker in self._collector.remote_collectors]
         answered, _ = ray.wait(pings, num_returns=len(pings), timeout=PROBE_SECONDS)
-        deaths = {node: _death(ping) for node, ping in zip(self._nodes, pings, strict=True) if ping in answered}
-        lost = {node: death for node, death in deaths.items() if death is not None}
-        for node, death in lost.items():
-            if death.actor_init_failed:
+        deaths = [(node, _death(ping)) for node, ping in zip(self._nodes, pings, strict=True) if ping in answered]
+        lost = {node for node, death in deaths if death is not None}
+        for node, death in deaths:
+            if death is not None and death.actor_init_failed:
                 reason = str(death).strip().splitlines()[-1]
                 return WorkerError(f"a worker cannot start on {node.name}: {reason}")
         if not lost:
@@ -279,7 +278,6 @@ def _collector(
         backend="ray",
         sync=True,
         frames_per_batch=config.frames_per_batch,
-        total_frames=sys.maxsize,
         backend_options=options,
     )
 

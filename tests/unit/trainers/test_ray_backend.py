@@ -16,7 +16,7 @@ from cura_torchrl.trainers import ray_backend
 from cura_torchrl.trainers import train as module
 from cura_torchrl.trainers.build import Networks, build_collector
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint, read_config
-from cura_torchrl.trainers.errors import NonFiniteError, UnavailableError, WorkerError
+from cura_torchrl.trainers.errors import NodeLostError, NonFiniteError, UnavailableError, WorkerError
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.methods import method
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
@@ -54,11 +54,11 @@ def config(tmp_path: Path) -> TrainConfig:
 
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Two nodes of one processor each, as far as Ray knows."""
+    """Two nodes of two processors each, as far as Ray knows."""
     # Imported here: Ray's own test cluster draws in packages that nothing else needs.
     from ray.cluster_utils import Cluster  # noqa: PLC0415
 
-    options = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
+    options = {"num_cpus": 2, "object_store_memory": 80 * 2**20}
     started = Cluster(initialize_head=True, head_node_args={**options, "node_name": "one", "include_dashboard": False})
     try:
         started.add_node(node_name="two", **options)
@@ -116,7 +116,8 @@ def test_without_ray_the_error_says_what_to_install(config: TrainConfig, monkeyp
 
 @pytest.mark.slow
 def test_rollouts_come_from_both_nodes_with_the_learner_s_present_weights(config: TrainConfig, cluster: Any) -> None:
-    """Catches workers that are all on one node, or that go on with old weights or normalisation."""
+    """Catches workers that are all on one node, old weights or normalisation, or a dead worker beside a living one."""
+    config = config.replace(num_envs=3, num_workers=3)
     learner = Learner(config, Networks(config))
     actor = learner.networks.actor
     before = signal.getsignal(signal.SIGTERM)
@@ -129,15 +130,20 @@ def test_rollouts_come_from_both_nodes_with_the_learner_s_present_weights(config
         assert set(where) == {node.node_id for node in cluster.list_all_nodes()}
         for _ in range(3):
             batch = rollouts.next()
-            assert batch.shape == (2, 4)
-            assert batch["episode"][:, 0].flatten().tolist() == [0, 1]  # a row of each worker
+            assert batch.shape == (3, 4)
+            assert batch["episode"][:, 0].flatten().tolist() == [0, 1, 2]  # a row of each worker
             with torch.no_grad():
                 now = actor.module[0](batch.select("observation", "latent"))
             torch.testing.assert_close(now["loc"], batch["loc"], atol=1e-5, rtol=0)
             learner.update(batch)
+        # The first node has the third worker too, which lives on.
+        ray_backend.ray.kill(rollouts._collector.remote_collectors[0])
+        with pytest.raises(NodeLostError) as lost:
+            rollouts.next()
+        assert lost.value.node_ids == {where[0]} == {where[2]}
     with (
-        pytest.raises(WorkerError, match=r"num_workers is 4; accepted: up to 2, what the Ray cluster can hold"),
-        build_collector(config.replace(num_envs=4, num_workers=4), actor, frames_done=0),
+        pytest.raises(WorkerError, match=r"num_workers is 6; accepted: up to 3, what the Ray cluster can hold"),
+        build_collector(config.replace(num_envs=6, num_workers=6), actor, frames_done=0),
     ):
         pass
 
