@@ -23,7 +23,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 SOURCES := cura_torchrl tests $(wildcard docs/conf.py benchmarks examples)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check test-slow lint type contracts spelling wheel format coverage docs clean
+.PHONY: help setup demo test check test-slow test-ray lint type contracts spelling wheel format coverage docs clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1\t\2/p' Makefile | awk -F '\t' '{ printf "  make %-10s %s\n", $$1, $$2 }'
@@ -44,10 +44,13 @@ demo: $(STAMP) ## Play the shipped policies on PyBullet, write runs/demo/index.h
 test: lint type contracts spelling wheel ## Lint, types, import contracts, spelling, wheel, doctests and the fast tests
 	$(PYTEST) -n $(WORKERS) -m "not slow and not gpu" --doctest-modules cura_torchrl tests
 
-check: test ## What continuous integration runs
+check: test test-ray ## What continuous integration runs
 
 test-slow: $(STAMP) ## The tests that take more than half a minute each
 	$(PYTEST) -n $(WORKERS) -m "slow and not gpu" tests
+
+test-ray: $(STAMP) ## Those of them that start a Ray cluster of two nodes, one after the other
+	$(PYTEST) -m "slow and not gpu" tests/unit/trainers/test_ray_backend.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check $(SOURCES)

@@ -22,9 +22,10 @@ from cura_torchrl.modules import DistributionalCollisionEstimator, MapVAE, Obser
 from cura_torchrl.objectives import CURAAdvantage, CURALoss
 from cura_torchrl.trainers.errors import UnavailableError
 from cura_torchrl.trainers.privileged import ObstacleCode
+from cura_torchrl.trainers.ray_backend import RayRollouts, ray_rollouts
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
 
     from tensordict.nn import ProbabilisticTensorDictSequential
     from torchrl.collectors import BaseCollector
@@ -191,7 +192,7 @@ def make_worker_env(config: TrainConfig, num_envs: int, *, worker: int, frames_d
     Returns:
         The environment, which plays its own share of the scenarios.
     """
-    if config.num_workers > 1:
+    if config.num_workers > 1 or config.backend == "ray":
         # Runs in the worker: Ctrl-C is for the learner, and each worker draws its own exploration noise.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         torch.set_num_threads(1)
@@ -209,23 +210,26 @@ def make_worker_env(config: TrainConfig, num_envs: int, *, worker: int, frames_d
 
 @contextmanager
 def build_collector(
-    config: TrainConfig, policy: ProbabilisticTensorDictSequential, *, frames_done: int
-) -> Iterator[BaseCollector]:
-    """Collect rollouts in this process or in several, and stop them in the end.
+    config: TrainConfig,
+    policy: ProbabilisticTensorDictSequential,
+    *,
+    frames_done: int,
+    without: Collection[str] = (),
+) -> Iterator[BaseCollector | RayRollouts]:
+    """Collect rollouts in this process, in several, or on the nodes of a cluster, and stop them in the end.
 
     Args:
         config: Number of environments and processes.
         policy: Policy on the CPU; processes share its memory.
         frames_done: Environment steps so far.
+        without: Ray's identifiers of nodes that have died.
 
     Yields:
         Collector whose batches have the shape ``[num_envs, rollout_steps]``.
     """
+    make_env = functools.partial(make_worker_env, config, frames_done=frames_done)
     share = config.num_envs // config.num_workers
-    factories = [
-        functools.partial(make_worker_env, config, share, worker=worker, frames_done=frames_done)
-        for worker in range(config.num_workers)
-    ]
+    factories = [functools.partial(make_env, share, worker=worker) for worker in range(config.num_workers)]
     options: dict[str, Any] = {
         "frames_per_batch": config.frames_per_batch,
         "total_frames": -1,
@@ -235,6 +239,9 @@ def build_collector(
     if config.perception == "map":
         load_encoder(config.encoder)  # what is wrong with it is told here, and not by each worker
     with ExitStack() as stack:
+        if config.backend == "ray":
+            yield stack.enter_context(ray_rollouts(config, make_env, policy, without=without))
+            return
         if config.num_workers == 1:
             collector = Collector(factories[0], policy, **options)
         else:

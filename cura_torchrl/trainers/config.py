@@ -17,6 +17,7 @@ from cura_torchrl.trainers.decoding import decode, encode
 LoggerKind = Literal["csv", "tensorboard", "wandb"]
 ScriptedKind = Literal["scripted", "avoider", "random"]
 Perception = Literal["map", "none", "privileged"]
+Backend = Literal["process", "ray"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,7 +156,10 @@ class TrainConfig:
     num_envs: int = 64
     """Environments over all workers together [1]."""
     num_workers: int = 1
-    """Processes that collect [1]; 1 collects in the learner's own process."""
+    """Processes that collect [1]; 1 collects in the learner's own process, unless the backend is ray."""
+    backend: Backend = "process"
+    """Where the workers run: on this machine, or on the nodes of a Ray cluster (of RAY_ADDRESS, or that this machine is
+    part of), each on a processor of its own. A node that dies is left out, and the others share its environments."""
     total_frames: int = 2_000_000
     """Environment steps to train for [1], rounded up to whole rollouts."""
     seed: int = 0

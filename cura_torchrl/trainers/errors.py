@@ -24,6 +24,23 @@ class WorkerError(RunError):
     """A process that collects has died."""
 
 
+class NodeLostError(WorkerError):
+    """A node of the cluster, or the worker on it, has died; the run can go on without it.
+
+    Args:
+        names: Names and addresses of the nodes that have died.
+        node_ids: Ray's identifiers of them.
+
+    Examples:
+        >>> str(NodeLostError("two (192.0.2.2)", frozenset({"ab12"})))
+        'node two (192.0.2.2) has died, or the worker on it'
+    """
+
+    def __init__(self, names: str, node_ids: frozenset[str]) -> None:
+        super().__init__(f"node {names} has died, or the worker on it")
+        self.node_ids = node_ids
+
+
 class UnavailableError(RunError):
     """A part that was asked for is not installed or not there."""
 

@@ -87,13 +87,14 @@ def capabilities() -> dict[str, bool]:
         Whether a part works, by name.
 
     Examples:
-        >>> set(capabilities()) == {"bullet", "tensorboard", "wandb", "encoder weights"}
+        >>> set(capabilities()) == {"bullet", "tensorboard", "wandb", "ray", "encoder weights"}
         True
     """
     return {
         "bullet": _is_installed("pybullet"),
         "tensorboard": _is_installed("tensorboard"),
         "wandb": _is_installed("wandb"),
+        "ray": _is_installed("ray"),
         "encoder weights": (Path(__file__).parents[1] / "modules" / "weights" / "map_vae.pt").exists(),
     }
 

@@ -28,9 +28,10 @@ from cura_torchrl.trainers.diagnostics import (
     finished_episodes,
     rollout_statistics,
 )
-from cura_torchrl.trainers.errors import CheckpointError, Interrupted, WorkerError
+from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NodeLostError, WorkerError
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.progress import Progress
+from cura_torchrl.trainers.ray_backend import RayRollouts, require_ray
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -63,7 +64,11 @@ def train(config: TrainConfig, *, resume: bool = False, init_from: Path | None =
         CheckpointError: If a checkpoint is missing or damaged, or ``run_dir`` holds a run that is not to be resumed.
         NonFiniteError: If a reward, an observation, a loss or a gradient is not finite; the last checkpoint is intact.
         Interrupted: If SIGINT or SIGTERM asked the run to stop.
+        WorkerError: If a process that collects has died, or no node is left that could.
+        UnavailableError: If a part that was asked for is not installed.
     """  # noqa: DOC502 - raised by what this calls
+    if config.backend == "ray":
+        require_ray()
     with _locked(config.run_dir), _Signals() as signals:
         return _Run(config, resume=resume, init_from=init_from).loop(signals)
 
@@ -137,11 +142,9 @@ class _Run:
         progress = Progress(self.config, frames=frames)
         recent = RecentEpisodes(self.config.recent_episodes)
         try:
-            with (
-                _worker_errors(signals),
-                build_collector(self.config, self.policy, frames_done=frames) as collector,
-            ):
-                self._iterate(collector, signals, progress, recent)
+            lost: frozenset[str] = frozenset()
+            while self.learner.frames < self.config.total_frames:
+                lost |= self._collect(signals, progress, recent, lost)
         except Interrupted:
             # Raised only between updates or while collecting, so what is saved is the end of a whole update.
             self._save()
@@ -155,7 +158,30 @@ class _Run:
         if self.policy is not self.learner.networks.actor:
             self.policy.load_state_dict(self.learner.networks.actor.state_dict())
 
-    def _iterate(self, collector: BaseCollector, signals: _Signals, progress: Progress, recent: RecentEpisodes) -> None:
+    def _collect(
+        self, signals: _Signals, progress: Progress, recent: RecentEpisodes, without: frozenset[str]
+    ) -> frozenset[str]:
+        # Trains until the frames are spent or nodes have died, and returns which.
+        frames = self.learner.frames
+        try:
+            with (
+                _worker_errors(signals),
+                build_collector(self.config, self.policy, frames_done=frames, without=without) as collector,
+            ):
+                self._iterate(collector, signals, progress, recent)
+        except NodeLostError as error:
+            # Raised between updates, like a signal: the checkpoint that the run goes on from loses none of them.
+            logger.warning("%s; the run goes on from %s without it", error, self._save())
+            return error.node_ids
+        return frozenset()
+
+    def _iterate(
+        self,
+        collector: BaseCollector | RayRollouts,
+        signals: _Signals,
+        progress: Progress,
+        recent: RecentEpisodes,
+    ) -> None:
         while self.learner.frames < self.config.total_frames:
             started = time.monotonic()
             with signals.raising():

@@ -86,6 +86,7 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
         (["train", "--ppo.lr", "nan"], "lr is nan; accepted: finite numbers"),
         (["train", "--env.task.episode-time", "nan"], "episode_time is nan; accepted: finite numbers"),
         (["train", "--simulator", "isaac"], "--simulator"),
+        (["train", "--backend", "slurm"], "--backend"),
         (["train", "--resume", "--run-dir", "{tmp}"], "no checkpoint at"),
         (["train", "--logger", "carrier-pigeon"], "--logger"),
         (["train", "--encoder", "{tmp}/none.pt", "--run-dir", "{tmp}/run"], "cura-torchrl pretrain-map"),

@@ -32,6 +32,7 @@ def train_configs(draw: st.DrawFn) -> TrainConfig:
     return preset.replace(
         num_envs=workers * draw(st.integers(1, 64)),
         num_workers=workers,
+        backend=draw(st.sampled_from(["process", "ray"])),
         seed=draw(st.integers(0, 2**31 - 1)),
         run_dir=Path(draw(st.text(st.characters(categories=["L", "N"]), min_size=1, max_size=8))),
         encoder=draw(st.none() | st.just(Path("weights/map_vae.pt"))),
@@ -67,6 +68,7 @@ def test_a_configuration_survives_a_json_file(config: TrainConfig) -> None:
         ({"num_envs": None}, "num_envs is None; accepted: a whole number"),
         ({"num_envs": 3, "num_workers": 2}, "num_envs is 3; accepted: a multiple of num_workers 2"),
         ({"simulator": "isaac"}, "simulator is 'isaac'; accepted: bullet, planar"),
+        ({"backend": "slurm"}, "backend is 'slurm'; accepted: process, ray"),
         ({"run_dir": 3}, "run_dir is 3; accepted: a path"),
         ({"network": {"actor_hidden_sizes": 3}}, "network.actor_hidden_sizes is 3; accepted: a list"),
         (
