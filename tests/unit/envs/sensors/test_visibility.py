@@ -15,15 +15,22 @@ from cura_torchrl.envs.sensors import (
     inside_rectangle,
     outside_footprint,
     ray_angles,
+    sample_map,
+    sample_table,
     scan_points,
     seen_free,
     unit_vector,
-    window_cells,
     window_offsets,
-    work_space,
+    window_points,
 )
 
 GRID = MapGrid(extent_x=(-2.0, 2.0), extent_y=(-1.5, 1.5), resolution=0.1)
+
+
+def window_cells(offsets: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
+    """Return which cell of GRID each window cell shows, by its index in the flattened map; 0 outside of the extent."""
+    indices = torch.arange(float(GRID.num_rows * GRID.num_columns)).view(1, GRID.num_rows, GRID.num_columns)
+    return sample_map(GRID, indices, window_points(GRID, offsets, pose)).long()
 
 
 def place(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> torch.Tensor:
@@ -125,8 +132,7 @@ class TestSeenFree:
     def test_work_space_changes_nothing(self) -> None:
         """Catches a result that depends on what the reused memory held."""
         scan, poses = torch.rand(3, 36) * 3, torch.rand(3, 3)
-        space = work_space((3, 42, 32), 1)
-        space[0].fill_(math.nan)
+        space = torch.full((3, 42, 32), math.nan)
         fresh = seen_free(GRID.row_x(), GRID.column_y(), scan, poses, GRID.half_diagonal)
         reused = seen_free(GRID.row_x(), GRID.column_y(), scan, poses, GRID.half_diagonal, space)
         assert torch.equal(fresh, reused)
@@ -171,15 +177,15 @@ class TestWindow:
     def test_a_quarter_turn_turns_the_window(self, quarter: int) -> None:
         """Catches a mirrored window or a rotation by the wrong sign."""
         offsets = window_offsets(10, 0.1)
-        straight = window_cells(GRID, offsets, place(0.0, 0.0, 0.0))
-        turned = window_cells(GRID, offsets, place(0.0, 0.0, quarter * math.pi / 2))
+        straight = window_cells(offsets, place(0.0, 0.0, 0.0))
+        turned = window_cells(offsets, place(0.0, 0.0, quarter * math.pi / 2))
         # A quarter turn to the left: (ahead u, left v) is world (-v, u), so turned[i, j] = straight[W - 1 - j, i], or
         # torch.rot90 by -1: what was ahead (large i) is now to the right (small j).
         assert torch.equal(torch.rot90(straight, -quarter, (1, 2)), turned)
 
     def test_rows_look_ahead_and_columns_to_the_left(self) -> None:
         """Catches swapped axes."""
-        cells = window_cells(GRID, window_offsets(4, 0.1), place())[0]
+        cells = window_cells(window_offsets(4, 0.1), place())[0]
         rows, columns = cells // 32, cells % 32
         # x = 0.15 is in row 1 + floor(2.15 / 0.1) = 22, y = 0.15 in column floor(1.65 / 0.1) = 16.
         assert rows[:, 0].tolist() == [19, 20, 21, 22]
@@ -188,12 +194,12 @@ class TestWindow:
     @pytest.mark.parametrize("where", [(50.0, 0.0), (-50.0, 0.0), (0.0, 50.0), (0.0, -50.0), (1e4, 1e4), (500.0, 1.6)])
     def test_far_outside_shows_only_outside_cells(self, where: tuple[float, float]) -> None:
         """Catches an index that comes back into the map, from however far."""
-        cells = window_cells(GRID, window_offsets(10, 0.1), place(*where, 0.3))
+        cells = window_cells(window_offsets(10, 0.1), place(*where, 0.3))
         assert torch.isin(cells // 32, torch.tensor([0, 41])).all()
 
     def test_half_outside_shows_both(self) -> None:
         """Catches a clamp that repeats the map's edge."""
-        cells = window_cells(GRID, window_offsets(10, 0.1), place(0.0, 1.5, 0.0))[0]
+        cells = window_cells(window_offsets(10, 0.1), place(0.0, 1.5, 0.0))[0]
         rows = cells // 32
         assert (rows[:, :5] >= 1).all()
         assert (rows[:, :5] <= 40).all()
