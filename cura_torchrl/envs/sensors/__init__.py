@@ -13,16 +13,24 @@ from cura_torchrl.envs.sensors.visibility import (
     unit_vector,
     view_scan,
 )
-from cura_torchrl.envs.sensors.window import outside_footprint, sample_map, window_offsets, window_points
+from cura_torchrl.envs.sensors.window import (
+    footprint_frame,
+    inside_footprint,
+    map_frame,
+    sample_map,
+    window_offsets,
+)
 
 __all__ = [
     "Lidar",
     "MapGrid",
     "cell_of_points",
     "clean_scan",
+    "footprint_frame",
     "free_margin",
+    "inside_footprint",
     "inside_rectangle",
-    "outside_footprint",
+    "map_frame",
     "ray_angles",
     "ray_ends",
     "sample_map",
@@ -33,5 +41,4 @@ __all__ = [
     "unit_vector",
     "view_scan",
     "window_offsets",
-    "window_points",
 ]

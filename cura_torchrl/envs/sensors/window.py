@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch.nn import functional as F  # noqa: N812
 
-from cura_torchrl.envs.sensors.visibility import MapGrid, unit_vector
+from cura_torchrl.envs.sensors.visibility import MapGrid
 
 def window_offsets(window: int, resolution: float) -> torch.Tensor:
     """Return the distance of each window row (or column) from the window's centre.
@@ -24,10 +26,29 @@ def window_offsets(window: int, resolution: float) -> torch.Tensor:
     return ((torch.arange(window, dtype=torch.float64) - (window - 1) / 2) * resolution).float()
 
 
-def window_points(
-    grid: MapGrid, offsets: torch.Tensor, sensor_pose: torch.Tensor, scratch: torch.Tensor | None = None
-) -> torch.Tensor:
-    """Return where the cells of a window lie that is centred on, and turned with, the sensor.
+class WindowFrame(NamedTuple):
+    """Coordinates of the cells of a window as sums of a row's and a column's terms: the cells cost one addition."""
+
+    rows: torch.Tensor
+    """Terms of the rows, shape ``[2, N, W, 1]``."""
+    columns: torch.Tensor
+    """Terms of the columns, shape ``[2, N, 1, W]``."""
+
+    def points(self, rows: slice, scratch: torch.Tensor | None = None) -> torch.Tensor:
+        """Return the coordinates of the cells of some of the windows.
+
+        Args:
+            rows: Which of the windows.
+            scratch: Memory to overwrite, shape ``[2, N, W, W]``; None allocates it.
+
+        Returns:
+            The two coordinates of each cell, shape ``[N, W, W, 2]``; aliases the scratch.
+        """
+        return torch.add(self.rows[:, rows], self.columns[:, rows], out=scratch).permute(1, 2, 3, 0)
+
+
+def map_frame(grid: MapGrid, offsets: torch.Tensor, sensor_pose: torch.Tensor) -> WindowFrame:
+    """Return where the cells of a window that is centred on, and turned with, the sensor lie on a grid.
 
     Window row ``i`` lies at base-frame x = ``offsets[i]`` (forward as ``i`` grows), column ``j`` at base-frame
     y = ``offsets[j]`` (to the left as ``j`` grows).
@@ -36,30 +57,54 @@ def window_points(
         grid: The map's cells.
         offsets: Window offsets as from :func:`window_offsets` [m], shape ``[W]``.
         sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
-        scratch: Memory to overwrite, shape ``[2, N, W, W]``; None allocates it.
 
     Returns:
-        World y and x of the centres of the window's cells, of which the extent spans -1 to 1 [1], shape
-        ``[N, W, W, 2]``; aliases the scratch.
+        World y and x of the centres of the window's cells, of which the extent spans -1 to 1 [1].
 
     Examples:
         >>> grid = MapGrid(extent_x=(0.0, 0.4), extent_y=(0.0, 0.8), resolution=0.1)
-        >>> points = window_points(grid, window_offsets(2, 0.2), torch.tensor([[0.2, 0.2, 0.0]]))
-        >>> [[round(value, 3) for value in point] for point in points[0, :, 0].tolist()]
+        >>> frame = map_frame(grid, window_offsets(2, 0.2), torch.tensor([[0.2, 0.2, 0.0]]))
+        >>> [[round(value, 3) for value in point] for point in frame.points(slice(None))[0, :, 0].tolist()]
         [[-0.75, -0.5], [-0.75, 0.5]]
     """
-    pose = sensor_pose[:, None, None].double()
-    cos, sin = pose[..., 2].cos(), pose[..., 2].sin()
-    ahead, left = offsets[:, None].double(), offsets.double()
-    per_x, per_y = 2.0 / (grid.num_x * grid.resolution), 2.0 / (grid.num_y * grid.resolution)
-    shape = (len(sensor_pose), len(offsets), len(offsets))
-    points = offsets.new_empty(2, *shape) if scratch is None else scratch
-    # Only the sums run over the window's cells; their terms cost next to nothing, and double.
-    row = (pose[..., 1] - grid.extent_y[0] + sin * ahead).mul_(per_y).sub_(1.0).float()
-    torch.add(row, (cos * left).mul_(per_y).float(), out=points[0])
-    row = (pose[..., 0] - grid.extent_x[0] + cos * ahead).mul_(per_x).sub_(1.0).float()
-    torch.add(row, (sin * left).mul_(-per_x).float(), out=points[1])
-    return points.permute(1, 2, 3, 0)
+    x, y, yaw = sensor_pose.double().unbind(-1)
+    corner = torch.tensor([grid.extent_y[0], grid.extent_x[0]], dtype=torch.float64, device=offsets.device)
+    half = torch.tensor([grid.num_y, grid.num_x], dtype=torch.float64, device=offsets.device) * (grid.resolution / 2)
+    centre = torch.stack([y, x]) - corner[:, None]
+    ahead, left = torch.stack([yaw.sin(), yaw.cos()]), torch.stack([yaw.cos(), -yaw.sin()])
+    return _frame(offsets, centre / half[:, None] - 1.0, ahead / half[:, None], left / half[:, None])
+
+
+def footprint_frame(
+    offsets: torch.Tensor, sensor_pose: torch.Tensor, pose: torch.Tensor, size: torch.Tensor
+) -> WindowFrame:
+    """Return where the cells of the sensor's window lie on a rectangle.
+
+    Args:
+        offsets: Window offsets as from :func:`window_offsets` [m], shape ``[W]``.
+        sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
+        pose: Rectangle's centre (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
+        size: Rectangle's (length, width) [m], shape ``[N, 2]`` or ``[2]``.
+
+    Returns:
+        Place of the cells' centres along and across the rectangle, which spans -1 to 1 [1].
+
+    Examples:
+        >>> frame = footprint_frame(torch.tensor([0.0, 1.0]), torch.zeros(1, 3), torch.zeros(1, 3), torch.ones(2))
+        >>> frame.points(slice(None))[0, 1].tolist()
+        [[2.0, 0.0], [2.0, 2.0]]
+    """
+    shift_x, shift_y, turn = (sensor_pose.double() - pose.double()).unbind(-1)
+    yaw, half = pose[:, 2].double(), (size.double() / 2).expand(len(pose), 2).T
+    centre = torch.stack([shift_x * yaw.cos() + shift_y * yaw.sin(), shift_y * yaw.cos() - shift_x * yaw.sin()])
+    ahead, left = torch.stack([turn.cos(), turn.sin()]), torch.stack([-turn.sin(), turn.cos()])
+    return _frame(offsets, centre / half, ahead / half, left / half)
+
+
+def _frame(offsets: torch.Tensor, centre: torch.Tensor, ahead: torch.Tensor, left: torch.Tensor) -> WindowFrame:
+    # The terms are few, so double costs nothing. All have shape [2, N].
+    rows = torch.addcmul(centre[..., None], ahead[..., None], offsets.double())
+    return WindowFrame(rows[..., None].float(), (left[..., None] * offsets.double())[..., None, :].float())
 
 
 def sample_map(grid: MapGrid, maps: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
@@ -68,7 +113,7 @@ def sample_map(grid: MapGrid, maps: torch.Tensor, points: torch.Tensor) -> torch
     Args:
         grid: The maps' cells.
         maps: Stored maps, shape ``[N, num_rows, num_columns]``.
-        points: Points as from :func:`window_points` [1], shape ``[N, H, W, 2]``.
+        points: Points as from :func:`map_frame` [1], shape ``[N, H, W, 2]``.
 
     Returns:
         Values, 0 outside of the extent, shape ``[N, H, W]``.
@@ -82,39 +127,19 @@ def sample_map(grid: MapGrid, maps: torch.Tensor, points: torch.Tensor) -> torch
     return F.grid_sample(grid.inside(maps)[:, None], points, mode="nearest", align_corners=False)[:, 0]
 
 
-def outside_footprint(
-    offsets: torch.Tensor,
-    sensor_pose: torch.Tensor,
-    pose: torch.Tensor,
-    size: torch.Tensor,
-    scratch: torch.Tensor | None = None,
-) -> torch.Tensor:
-    """Tell which cells of the sensor's window have their centre outside of a rectangle.
+def inside_footprint(points: torch.Tensor) -> torch.Tensor:
+    """Tell which points lie inside of a rectangle that spans -1 to 1.
 
     Args:
-        offsets: Window offsets as from :func:`window_offsets` [m], shape ``[W]``.
-        sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
-        pose: Rectangle's centre (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
-        size: Rectangle's (length, width) [m], shape ``[N, 2]`` or ``[2]``.
-        scratch: Memory to overwrite, shape ``[2, N, W, W]``; None allocates it.
+        points: Points as from :func:`footprint_frame` [1], shape ``[N, H, W, 2]``.
 
     Returns:
-        1 outside, 0 inside or on the edge, float32, shape ``[N, W, W]``; aliases the scratch.
+        1 inside or on the edge, 0 outside, float32, shape ``[N, H, W]``.
 
     Examples:
-        >>> sensor, box = torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0]])
-        >>> outside_footprint(window_offsets(2, 1.0), sensor, box, torch.ones(2)).tolist()
-        [[[1.0, 1.0], [1.0, 0.0]]]
+        >>> inside_footprint(torch.tensor([[[[0.0, 0.9], [1.1, 0.0]]]])).tolist()
+        [[[1.0, 0.0]]]
     """
-    yaw = sensor_pose[:, 2, None, None]
-    cos, sin = unit_vector(yaw)
-    shift_x, shift_y = (pose[:, :2] - sensor_pose[:, :2])[..., None, None].unbind(1)
-    ahead = offsets[:, None] - (shift_x * cos + shift_y * sin)
-    left = offsets - (shift_y * cos - shift_x * sin)
-    cos, sin = unit_vector(pose[:, 2, None, None] - yaw)
-    half = (size / 2)[..., None, None]
-    shape = (len(sensor_pose), len(offsets), len(offsets))
-    along, across = offsets.new_empty(2, *shape) if scratch is None else scratch
-    torch.add(cos * ahead, sin * left, out=along).abs_().sub_(half[..., 0, :, :])
-    torch.add(-sin * ahead, cos * left, out=across).abs_().sub_(half[..., 1, :, :])
-    return torch.maximum(along, across, out=along).sign_().relu_()
+    # The rectangle is an image of one pixel, and what is not found in an image is 0.
+    pixel = points.new_ones(1, 1, 1, 1).expand(len(points), 1, 1, 1)
+    return F.grid_sample(pixel, points, mode="nearest", align_corners=False)[:, 0]

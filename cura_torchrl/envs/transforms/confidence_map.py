@@ -118,6 +118,7 @@ class ConfidenceMap(Transform):
         self.grid = MapGrid(extent_x=config.extent_x, extent_y=config.extent_y, resolution=config.resolution)
         offsets = window.window_offsets(config.window, config.resolution)
         origin, powers = torch.zeros(1, 3), _decay_powers(config.decay)
+        robot = window.footprint_frame(offsets, origin, origin, torch.tensor(robot_size))
         tables = {
             "_row_x": self.grid.row_x(),
             "_column_y": self.grid.column_y(),
@@ -125,7 +126,8 @@ class ConfidenceMap(Transform):
             "_directions": torch.stack(visibility.unit_vector(ray_angles(num_rays))),
             "_powers": powers[None],
             "_robot_size": torch.tensor(robot_size),
-            "_outside_robot": window.outside_footprint(offsets, origin, origin, torch.tensor(robot_size)),
+            # Times two, for what tells an obstacle from free space is half a step.
+            "_robot_mask": 2.0 - 2.0 * window.inside_footprint(robot.points(slice(None))),
         }
         for name, table in tables.items():
             self.register_buffer(name, table, persistent=False)
@@ -223,8 +225,12 @@ class ConfidenceMap(Transform):
             for cells, stamp in hits:
                 maps.scatter_(1, cells[rows], stamp[rows])
         windows = scan.new_empty(len(scan), self.num_channels, self.config.window, self.config.window)
-        for rows, scratches in _chunks(len(scan), self._window_space):
-            self._fill(windows[rows], stamps[rows], steps[rows], [item[rows] for item in inputs], scratches)
+        frames = [window.map_frame(self.grid, self._offsets, pose)]
+        if len(inputs) > 2:
+            frames.append(window.footprint_frame(self._offsets, pose, inputs[2], inputs[3]))
+        for rows, scratch in _chunks(len(scan), self._window_space):
+            points = (frame.points(rows, scratch) for frame in frames)
+            self._fill(windows[rows], stamps[rows], steps[rows], points, scratch)
         return windows
 
     def _allocate(self, device: torch.device) -> None:
@@ -256,11 +262,10 @@ class ConfidenceMap(Transform):
         windows: torch.Tensor,
         stamps: torch.Tensor,
         steps: torch.Tensor,
-        inputs: list[torch.Tensor],
+        points: Iterator[torch.Tensor],
         scratch: torch.Tensor,
     ) -> None:
-        points = window.window_points(self.grid, self._offsets, inputs[1], scratch)
-        stamp = window.sample_map(self.grid, stamps, points)
+        stamp = window.sample_map(self.grid, stamps, next(points))
         last_seen, age = torch.floor(stamp, out=scratch[0]), scratch[1]
         # The age as the coordinate of its power in the table.
         scale = 2.0 / self._powers.shape[-1]
@@ -268,9 +273,10 @@ class ConfidenceMap(Transform):
         windows[:, 0] = visibility.sample_table(self._powers.expand(len(age), -1), age)
         if self.config.channels == "confidence":
             return
-        occupancy = stamp.sub_(last_seen).mul_(self._outside_robot).mul_(2.0)
-        if len(inputs) > 2:
-            occupancy.mul_(window.outside_footprint(self._offsets, inputs[1], inputs[2], inputs[3], scratch))
+        occupancy = stamp.sub_(last_seen).mul_(self._robot_mask)
+        # What is left is the object's footprint, if there is one; its points overwrite the scratch.
+        for footprint in points:
+            occupancy.sub_(window.inside_footprint(footprint)).relu_()
         if self.config.channels == "product":
             windows[:, 0] *= occupancy
         else:

@@ -12,8 +12,10 @@ from cura_torchrl.envs.sensors import (
     MapGrid,
     cell_of_points,
     clean_scan,
+    footprint_frame,
+    inside_footprint,
     inside_rectangle,
-    outside_footprint,
+    map_frame,
     ray_angles,
     sample_map,
     sample_table,
@@ -21,7 +23,6 @@ from cura_torchrl.envs.sensors import (
     seen_free,
     unit_vector,
     window_offsets,
-    window_points,
 )
 
 GRID = MapGrid(extent_x=(-2.0, 2.0), extent_y=(-1.5, 1.5), resolution=0.1)
@@ -30,7 +31,7 @@ GRID = MapGrid(extent_x=(-2.0, 2.0), extent_y=(-1.5, 1.5), resolution=0.1)
 def window_cells(offsets: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
     """Return which cell of GRID each window cell shows, by its index in the flattened map; 0 outside of the extent."""
     indices = torch.arange(float(GRID.num_rows * GRID.num_columns)).view(1, GRID.num_rows, GRID.num_columns)
-    return sample_map(GRID, indices, window_points(GRID, offsets, pose)).long()
+    return sample_map(GRID, indices, map_frame(GRID, offsets, pose).points(slice(None))).long()
 
 
 def place(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> torch.Tensor:
@@ -153,12 +154,13 @@ class TestRectangles:
         """Catches a footprint that is computed in the wrong frame."""
         # Sensor at (1, 1) turned left by 90 degrees: the box centre (1, 3) is 2 m straight ahead of it.
         offsets = window_offsets(6, 1.0)  # -2.5 ... 2.5
-        outside = outside_footprint(
+        frame = footprint_frame(
             offsets, place(1.0, 1.0, math.pi / 2), place(1.0, 3.0, math.pi / 2), torch.tensor([1.2, 1.2])
         )
-        expected = torch.ones(6, 6)
-        expected[4:, 2:4] = 0.0  # rows at 1.5 and 2.5, columns at -0.5 and 0.5
-        assert torch.equal(outside[0], expected)
+        inside = inside_footprint(frame.points(slice(None)))
+        expected = torch.zeros(6, 6)
+        expected[4:, 2:4] = 1.0  # rows at 1.5 and 2.5, columns at -0.5 and 0.5
+        assert torch.equal(inside[0], expected)
 
 
 class TestWindow:
