@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch.nn import functional as F  # noqa: N812
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 _FAR = 1e6
 """Coordinate of the cells that stand for the outside [m]: beyond the reach of any ray."""
@@ -138,7 +141,7 @@ def clean_scan(scan: torch.Tensor, max_range: float) -> torch.Tensor:
 
 
 class ScanView(NamedTuple):
-    """A scan as the cells of a grid ask for it; everything is per sensor, so that a slice of each field is a view too.
+    """A scan as the cells of a grid ask for it; everything is per sensor, so that a part of it is a view too.
 
     The bearings of a row of cells span half a turn, from -90 to 90 degrees around one of two directions, by which side
     of the sensor the row lies on. The table holds the rays of both half turns, one after the other.
@@ -159,16 +162,17 @@ class ScanView(NamedTuple):
     per_radian: float
     """Coordinate in the table per bearing [1/rad]."""
 
-    def part(self, rows: slice) -> ScanView:
-        """Return the view of some of the sensors.
+    def split(self, size: int) -> Iterator[ScanView]:
+        """Go through the view in parts.
 
         Args:
-            rows: Which of them.
+            size: Sensors of a part [1].
 
-        Returns:
-            Their view, which aliases this one.
+        Yields:
+            Views of that many sensors, the last one of those that are left; they alias this one.
         """
-        return ScanView(*(item if isinstance(item, float) else item[rows] for item in self))
+        for tensors in zip(*(tensor.split(size) for tensor in self[:-1]), strict=True):
+            yield ScanView._make((*tensors, self.per_radian))
 
 
 def view_scan(
@@ -275,10 +279,10 @@ def sample_table(table: torch.Tensor, coordinate: torch.Tensor) -> torch.Tensor:
 
     Args:
         table: Entries, shape ``[N, K]``.
-        coordinate: Where to look [1]: entry k lies at ``(2 k + 1) / K - 1``, shape ``[N, *S]`` with two dimensions in S.
+        coordinate: Where to look [1]: entry k lies at ``(2 k + 1) / K - 1``, shape ``[N, H, W]``.
 
     Returns:
-        Entries, 0 where the coordinate is outside of -1 to 1, shape ``[N, *S]``.
+        Entries, 0 where the coordinate is outside of -1 to 1, shape ``[N, H, W]``.
 
     Examples:
         >>> sample_table(torch.tensor([[5.0, 6.0]]), torch.tensor([[[-0.9, -0.1, 0.1, 1.1]]])).tolist()

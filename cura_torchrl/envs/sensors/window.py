@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch.nn import functional as F  # noqa: N812
 
-from cura_torchrl.envs.sensors.visibility import MapGrid
+if TYPE_CHECKING:
+    from cura_torchrl.envs.sensors.visibility import MapGrid
+
 
 def window_offsets(window: int, resolution: float) -> torch.Tensor:
     """Return the distance of each window row (or column) from the window's centre.
@@ -62,6 +64,7 @@ def map_frame(grid: MapGrid, offsets: torch.Tensor, sensor_pose: torch.Tensor) -
         World y and x of the centres of the window's cells, of which the extent spans -1 to 1 [1].
 
     Examples:
+        >>> from cura_torchrl.envs.sensors import MapGrid
         >>> grid = MapGrid(extent_x=(0.0, 0.4), extent_y=(0.0, 0.8), resolution=0.1)
         >>> frame = map_frame(grid, window_offsets(2, 0.2), torch.tensor([[0.2, 0.2, 0.0]]))
         >>> [[round(value, 3) for value in point] for point in frame.points(slice(None))[0, :, 0].tolist()]
@@ -119,6 +122,7 @@ def sample_map(grid: MapGrid, maps: torch.Tensor, points: torch.Tensor) -> torch
         Values, 0 outside of the extent, shape ``[N, H, W]``.
 
     Examples:
+        >>> from cura_torchrl.envs.sensors import MapGrid
         >>> grid = MapGrid(extent_x=(0.0, 0.2), extent_y=(0.0, 0.1), resolution=0.1)
         >>> maps = torch.arange(64.0).view(1, 4, 16)
         >>> sample_map(grid, maps, torch.tensor([[[[0.0, -0.5], [0.0, 0.5], [0.0, 1.5]]]])).tolist()

@@ -63,7 +63,7 @@ class ConfidenceMap(Transform):
 
     A reset forgets the rows that are reset and integrates their first scan; in the other rows the window that
     ``_reset`` returns is 0, for TorchRL keeps their old value. Rows never depend on one another. A range that is not a
-    number has seen nothing; a pose that is not a number raises ``RuntimeError``. Called as a module, outside of an
+    number has seen nothing; a pose that is not finite raises ``RuntimeError``. Called as a module, outside of an
     environment, the transform integrates one more scan; it is no transform for a replay buffer, whose samples are in no
     order. The time of a step grows with the cells of the extent.
 
@@ -131,8 +131,8 @@ class ConfidenceMap(Transform):
         }
         for name, table in tables.items():
             self.register_buffer(name, table, persistent=False)
-        # t: seen free at time t; t + 1/2: seen occupied at time t; 0: never seen. So the greatest stamp counts, and a cell
-        # never seen is older than the table of powers reaches: the episode begins at its end. Exact below 2**20 steps.
+        # t: seen free at time t; t + 1/2: seen occupied at time t; 0: never seen. So the greatest one counts. Episodes
+        # begin at a time at which a cell never seen is older than the table of powers is long. Exact for 2**20 steps.
         self._start = float(len(powers))
         self.register_buffer("_stamps", torch.zeros(0, self.grid.num_rows, self.grid.num_columns), persistent=False)
         self.register_buffer("_steps", torch.zeros(0), persistent=False)
@@ -219,8 +219,9 @@ class ConfidenceMap(Transform):
             self._allocate(scan.device)
         view = visibility.view_scan(self._row_x, self._column_y, scan, pose, self.grid.half_diagonal)
         hits = self._find_hits(scan, steps[:, None], inputs)
-        for rows, (scratch,) in _chunks(len(scan), self._map_space):
-            seen = visibility.free_margin(view.part(rows), scratch).sign_().mul_(steps[rows, None, None])
+        chunks = _chunks(len(scan), self._map_space)
+        for (rows, (scratch,)), part in zip(chunks, view.split(self._map_space.shape[1]), strict=True):
+            seen = visibility.free_margin(part, scratch).sign_().mul_(steps[rows, None, None])
             maps = torch.maximum(stamps[rows], seen, out=stamps[rows]).flatten(1)
             for cells, stamp in hits:
                 maps.scatter_(1, cells[rows], stamp[rows])

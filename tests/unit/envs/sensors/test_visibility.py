@@ -18,7 +18,6 @@ from cura_torchrl.envs.sensors import (
     map_frame,
     ray_angles,
     sample_map,
-    sample_table,
     scan_points,
     seen_free,
     unit_vector,
@@ -115,6 +114,28 @@ class TestSeenFree:
         )
         bearing = np.degrees((np.arctan2(y, x) - yaw + math.pi) % (2 * math.pi) - math.pi)
         np.testing.assert_array_equal(free.numpy(), (bearing > -67.5) & (bearing < -22.5))
+
+    @pytest.mark.parametrize("num_rays", [1, 2, 7, 45])
+    def test_any_number_of_rays_has_its_sectors(self, num_rays: int) -> None:
+        """Catches tables of half a turn that hold for even numbers of rays only, or for many."""
+        scan, yaw = torch.rand(1, num_rays, generator=torch.Generator().manual_seed(0)) * 2.0, 0.4
+        free = seen_free(GRID.row_x(), GRID.column_y(), scan, place(0.013, 0.021, yaw), 0.0)[0, 1:41, :30]
+        x, y = np.meshgrid(
+            -2 + (np.arange(40) + 0.5) * 0.1 - 0.013, -1.5 + (np.arange(30) + 0.5) * 0.1 - 0.021, indexing="ij"
+        )
+        ray = np.round((np.arctan2(y, x) - yaw + math.pi) * num_rays / (2 * math.pi)).astype(int) % num_rays
+        np.testing.assert_array_equal(free.numpy(), np.hypot(x, y) < scan[0].numpy()[ray])
+
+    def test_rows_and_columns_through_the_sensor_have_their_bearings(self) -> None:
+        """Catches a quotient of two zeros, and 90 degrees taken for -90 on the row whose distance is zero."""
+        grid = MapGrid(extent_x=(-1.5, 1.5), extent_y=(-1.5, 1.5), resolution=1.0)  # centres at -1, 0, 1
+        # Rays at -180, -90, 0 and 90 degrees, of which one sees.
+        for ray, cell in enumerate([(0, 1), (1, 0), (2, 1), (1, 2)]):
+            scan = torch.zeros(1, 4)
+            scan[0, ray] = 1.2
+            free = seen_free(grid.row_x(), grid.column_y(), scan, place(), 0.0)[0, 1:-1, :3]
+            free[1, 1] = 0.0  # the sensor's own cell, whose bearing is a convention
+            assert free.nonzero().tolist() == [list(cell)]
 
     def test_a_sensor_in_a_cell_centre_sees_its_cell(self) -> None:
         """Catches a division by zero at the sensor itself."""
