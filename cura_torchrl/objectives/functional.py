@@ -49,12 +49,12 @@ def energy_distance(prediction: torch.Tensor, target: torch.Tensor) -> torch.Ten
 @torch.no_grad()
 def _energy_weights(merged: torch.Tensor, num_x: int, num_y: int) -> torch.Tensor:
     # 2 sum_k D_k^2 (z_(k+1) - z_k) = sum_k z_k * 2 (D_(k-1)^2 - D_k^2), where D_k is F - G just above sorted atom z_k.
+    # With the step s_k = D_k - D_(k-1), the weight is 2 s_k (s_k - 2 D_k).
     order = merged.argsort(-1)
     # Steps of N M (F - G): whole numbers, so that the sums are exact.
-    steps = torch.where(order < num_x, float(num_y), -float(num_x)).to(merged.dtype)
-    squared = (steps.cumsum(-1) / (num_x * num_y)).square()
-    sorted_weights = -2.0 * squared
-    sorted_weights[..., 1:] += 2.0 * squared[..., :-1]
+    steps = torch.cat([merged.new_full((num_x,), num_y), merged.new_full((num_y,), -num_x)])
+    sorted_steps = steps.expand_as(merged).gather(-1, order)
+    sorted_weights = (sorted_steps - 2.0 * sorted_steps.cumsum(-1)) * sorted_steps * (2.0 / (num_x * num_y) ** 2)
     return torch.empty_like(merged).scatter_(-1, order, sorted_weights)
 
 

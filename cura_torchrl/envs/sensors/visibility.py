@@ -1,22 +1,27 @@
-"""Which cells of a grid a planar scan has seen, and what a moving window shows of that grid: pure batched geometry.
+"""Which cells of a grid a planar scan has seen: pure batched geometry.
 
-Comparisons and masked writes on bool tensors cost 5 to 15 times as much as float arithmetic on a CPU, so the large
-masks here are float 0/1 tensors, made by ``sign`` and ``relu``.
+On a CPU, comparisons, masked writes and integer indices on large tensors cost 5 to 15 times as much as float
+arithmetic. So the large masks here are float tensors, made by ``sign``, and the large lookups are nearest-neighbour
+samples of a table at a float coordinate: that kernel reads no integers, uses all vector lanes and all threads.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
+from torch.nn import functional as F  # noqa: N812
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator
 
 _FAR = 1e6
 """Coordinate of the cells that stand for the outside [m]: beyond the reach of any ray."""
+
+_NEAR = 1e-30
+"""Stands for a distance of 0 where it is divided by [m]: its inverse times any distance is finite."""
 
 _VECTOR_LANES = 16
 """Row lengths are multiples of this: no cell falls to a loop's scalar tail in one batch and not in another."""
@@ -77,6 +82,17 @@ class MapGrid:
         """Half of a cell's diagonal [m]."""
         return self.resolution * math.sqrt(0.5)
 
+    def inside(self, maps: torch.Tensor) -> torch.Tensor:
+        """Return the cells of the extent.
+
+        Args:
+            maps: Stored maps, shape ``[*B, num_rows, num_columns]``.
+
+        Returns:
+            View without what stands for the outside, shape ``[*B, num_x, num_y]``.
+        """
+        return maps[..., 1:-1, : self.num_y]
+
     def row_x(self) -> torch.Tensor:
         """Return the world x of the cell centres of each row [m], far away outside, shape ``[num_rows]``."""
         centres = self.extent_x[0] + (torch.arange(-1, self.num_x + 1, dtype=torch.float64) + 0.5) * self.resolution
@@ -88,25 +104,6 @@ class MapGrid:
         centres = self.extent_y[0] + (torch.arange(self.num_columns, dtype=torch.float64) + 0.5) * self.resolution
         centres[self.num_y :] = _FAR
         return centres.float()
-
-
-def work_space(shape: Sequence[int], num_floats: int, device: torch.device | None = None) -> tuple[torch.Tensor, ...]:
-    """Allocate memory that the functions below reuse: fresh memory can cost more than their arithmetic.
-
-    Args:
-        shape: Shape of each tensor; the first dimension is the largest batch.
-        num_floats: How many float32 tensors.
-        device: Where they live.
-
-    Returns:
-        ``num_floats`` float32 tensors, then one int64 tensor, uninitialised.
-
-    Examples:
-        >>> [tensor.dtype for tensor in work_space((2, 3), 1)]
-        [torch.float32, torch.int64]
-    """
-    floats = (torch.empty(*shape, device=device) for _ in range(num_floats))
-    return *floats, torch.empty(*shape, dtype=torch.int64, device=device)
 
 
 def unit_vector(angle: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -143,18 +140,45 @@ def clean_scan(scan: torch.Tensor, max_range: float) -> torch.Tensor:
     return scan.nan_to_num(nan=0.0, posinf=max_range).clamp(0.0, max_range)
 
 
-def seen_free(
-    row_x: torch.Tensor,
-    column_y: torch.Tensor,
-    scan: torch.Tensor,
-    sensor_pose: torch.Tensor,
-    half_diagonal: float,
-    scratch: Sequence[torch.Tensor] | None = None,
-) -> torch.Tensor:
-    """Tell which cells a scan has seen to be free.
+class ScanView(NamedTuple):
+    """A scan as the cells of a grid ask for it; everything is per sensor, so that a part of it is a view too.
 
-    A cell is seen free if its centre is nearer to the sensor than the range of the ray nearest to its bearing, less
-    half a cell's diagonal. This leaves no gaps between few rays and needs one lookup a cell.
+    The bearings of a row of cells span half a turn, from -90 to 90 degrees around one of two directions, by which side
+    of the sensor the row lies on. The table holds the rays of both half turns, one after the other.
+    """
+
+    table: torch.Tensor
+    """Square of the distance at which a ray stops to see cells free [m^2], shape ``[N, K]``."""
+    row_start: torch.Tensor
+    """Coordinate in the table of a bearing of 0 in the row's half turn [1], shape ``[N, X, 1]``."""
+    row_inverse: torch.Tensor
+    """One over the row's distance ahead of the sensor [1/m], shape ``[N, X, 1]``."""
+    row_square: torch.Tensor
+    """Square of the row's distance [m^2], shape ``[N, X, 1]``."""
+    column_offset: torch.Tensor
+    """Column's distance to the left of the sensor [m], shape ``[N, 1, Y]``."""
+    column_square: torch.Tensor
+    """Its square [m^2], shape ``[N, 1, Y]``."""
+    per_radian: float
+    """Coordinate in the table per bearing [1/rad]."""
+
+    def split(self, size: int) -> Iterator[ScanView]:
+        """Go through the view in parts.
+
+        Args:
+            size: Sensors of a part [1].
+
+        Yields:
+            Views of that many sensors, the last one of those that are left; they alias this one.
+        """
+        for tensors in zip(*(tensor.split(size) for tensor in self[:-1]), strict=True):
+            yield ScanView._make((*tensors, self.per_radian))
+
+
+def view_scan(
+    row_x: torch.Tensor, column_y: torch.Tensor, scan: torch.Tensor, sensor_pose: torch.Tensor, half_diagonal: float
+) -> ScanView:
+    """Prepare a scan for :func:`free_margin`.
 
     Args:
         row_x: World x of the cell centres of each row [m], shape ``[X]``.
@@ -163,10 +187,82 @@ def seen_free(
             ``[N, R]``.
         sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
         half_diagonal: Half of a cell's diagonal [m].
-        scratch: Work space of one float tensor to overwrite, shape ``[N, X, Y]``; None allocates it.
 
     Returns:
-        1 where the cell is seen free, else 0, float32, shape ``[N, X, Y]``; aliases the work space.
+        The scan by cells.
+
+    Examples:
+        >>> view_scan(torch.ones(4), torch.ones(5), torch.ones(2, 8), torch.zeros(2, 3), 0.07).row_start.shape
+        torch.Size([2, 4, 1])
+    """
+    num_rays = scan.shape[-1]
+    rays_per_radian = num_rays / (2 * math.pi)
+    # Nearest ray to world bearing b: floor((b - yaw + pi) R / 2 pi + 1/2) mod R. The table of a half turn starts at the
+    # ray nearest to its first bearing, less one for rounding, and ends one after that nearest to its last.
+    half = num_rays // 2 + 4
+    turned = (math.pi - sensor_pose[:, 2:].double()) * rays_per_radian + 0.5 - num_rays / 4
+    turned = torch.remainder(torch.cat([turned, turned + num_rays / 2], -1), num_rays)
+    first = turned.floor()
+    ray = (first.long()[..., None] + torch.arange(-1, half - 1, device=scan.device)).remainder(num_rays)
+    reach = (scan - half_diagonal).clamp_(min=0.0).square_()
+    # The table's coordinate runs from -1 to 1, as the sampling has it.
+    start = turned.sub_(first).add_(num_rays / 4 + 1.0).div_(half)
+    start[:, 0] -= 1.0
+    dx = row_x - sensor_pose[:, :1]
+    # On the row of the sensor itself the bearing is 90 or -90 degrees, and 0 at the sensor.
+    dx = torch.where(dx == 0.0, _NEAR, dx)[..., None]
+    dy = (column_y - sensor_pose[:, 1:2])[:, None]
+    row_start = torch.where(dx < 0.0, start[:, 1, None, None], start[:, 0, None, None]).float()
+    table = reach.gather(1, ray.flatten(1))
+    return ScanView(table, row_start, dx.reciprocal(), dx.square(), dy, dy.square(), rays_per_radian / half)
+
+
+def free_margin(view: ScanView, scratch: torch.Tensor | None = None) -> torch.Tensor:
+    """Return by how much cells are nearer than what has been measured at their bearing, in squares.
+
+    A cell is seen free if its centre is nearer to the sensor than the range of the ray nearest to its bearing, less
+    half a cell's diagonal. This leaves no gaps between few rays and needs one lookup a cell. Bearings are exact to
+    1e-4 of the angle between rays: nearer than that to the middle between two rays, either may be asked.
+
+    Args:
+        view: The scan, from :func:`view_scan`.
+        scratch: Memory to overwrite, shape ``[N, X, Y]``; None allocates it.
+
+    Returns:
+        Difference of the squares of range and distance [m^2], positive where seen free, shape ``[N, X, Y]``. Does not
+        alias the scratch.
+
+    Examples:
+        >>> view = view_scan(torch.tensor([1.0, 3.0]), torch.zeros(1), torch.full((1, 8), 2.0), torch.zeros(1, 3), 0.0)
+        >>> free_margin(view).flatten().tolist()
+        [3.0, -5.0]
+    """
+    coordinate = torch.mul(view.row_inverse, view.column_offset, out=scratch).atan_()
+    coordinate = torch.add(view.row_start, coordinate, alpha=view.per_radian, out=scratch)
+    return sample_table(view.table, coordinate).sub_(view.row_square).sub_(view.column_square)
+
+
+def seen_free(
+    row_x: torch.Tensor,
+    column_y: torch.Tensor,
+    scan: torch.Tensor,
+    sensor_pose: torch.Tensor,
+    half_diagonal: float,
+    scratch: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """Tell which cells a scan has seen to be free, as :func:`free_margin` defines it.
+
+    Args:
+        row_x: World x of the cell centres of each row [m], shape ``[X]``.
+        column_y: World y of the cell centres of each column [m], shape ``[Y]``.
+        scan: Ranges as from :func:`clean_scan` [m], rays as in :func:`~cura_torchrl.envs.sensors.ray_angles`, shape
+            ``[N, R]``.
+        sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
+        half_diagonal: Half of a cell's diagonal [m].
+        scratch: Memory to overwrite, shape ``[N, X, Y]``; None allocates it.
+
+    Returns:
+        1 where the cell is seen free, else 0, float32, shape ``[N, X, Y]``.
 
     Examples:
         >>> centres = torch.tensor([1.0, 2.0, 3.0])
@@ -174,19 +270,28 @@ def seen_free(
         >>> seen_free(centres, torch.zeros(1), scan, torch.zeros(1, 3), half_diagonal=0.07).flatten().tolist()
         [1.0, 1.0, 0.0]
     """
-    num_rays = scan.shape[-1]
-    rays_per_radian = num_rays / (2 * math.pi)
-    dx = row_x[:, None] - sensor_pose[:, 0, None, None]
-    dy = column_y - sensor_pose[:, 1, None, None]
-    position, ray = scratch or work_space((len(scan), len(row_x), len(column_y)), 1, scan.device)
-    # Nearest ray to world bearing b: floor((b - yaw + pi) R / 2 pi + 1/2) mod R. With the yaw taken modulo a turn and R
-    # added, the index is not negative, and the table three times in a row replaces the modulo.
-    turned = torch.remainder((math.pi - sensor_pose[:, 2]) * rays_per_radian, num_rays)
-    torch.atan2(dy, dx, out=position).mul_(rays_per_radian).add_((turned + (num_rays + 0.5))[:, None, None])
-    ray.copy_(position)
-    reach = (scan - half_diagonal).clamp_(min=0.0).square_().repeat(1, 3)
-    torch.gather(reach, 1, ray.flatten(1), out=position.flatten(1))
-    return position.sub_(dx.square()).sub_(dy.square()).sign_().relu_()
+    view = view_scan(row_x, column_y, scan, sensor_pose, half_diagonal)
+    return free_margin(view, scratch).sign_().relu_()
+
+
+def sample_table(table: torch.Tensor, coordinate: torch.Tensor) -> torch.Tensor:
+    """Look up the nearest entry of a table per row of the batch.
+
+    Args:
+        table: Entries, shape ``[N, K]``.
+        coordinate: Where to look [1]: entry k lies at ``(2 k + 1) / K - 1``, shape ``[N, H, W]``.
+
+    Returns:
+        Entries, 0 where the coordinate is outside of -1 to 1, shape ``[N, H, W]``.
+
+    Examples:
+        >>> sample_table(torch.tensor([[5.0, 6.0]]), torch.tensor([[[-0.9, -0.1, 0.1, 1.1]]])).tolist()
+        [[[5.0, 5.0, 6.0, 0.0]]]
+    """
+    # The table is an image of height 1, of which any second coordinate within -1 to 1 finds the only row: the first one
+    # serves, and saves a tensor.
+    points = coordinate[..., None].expand(*coordinate.shape, 2)
+    return F.grid_sample(table[:, None, None], points, mode="nearest", align_corners=False)[:, 0]
 
 
 def scan_points(
@@ -264,95 +369,3 @@ def cell_of_points(grid: MapGrid, x: torch.Tensor, y: torch.Tensor) -> tuple[tor
     row, column = i.clamp(0, grid.num_x - 1), j.clamp(0, grid.num_y - 1)
     is_inside = i.sub_(row).abs_().add_(j.sub_(column).abs_()) == 0.0
     return torch.add(column, row.add_(1), alpha=grid.num_columns).long(), is_inside
-
-
-def window_offsets(window: int, resolution: float) -> torch.Tensor:
-    """Return the distance of each window row (or column) from the window's centre.
-
-    Args:
-        window: Cells along the window's edge [1].
-        resolution: Edge of a cell [m].
-
-    Returns:
-        Base-frame x of the window's rows, which is the y of its columns too [m], shape ``[W]``.
-
-    Examples:
-        >>> window_offsets(4, 0.5).tolist()
-        [-0.75, -0.25, 0.25, 0.75]
-    """
-    return ((torch.arange(window, dtype=torch.float64) - (window - 1) / 2) * resolution).float()
-
-
-def window_cells(
-    grid: MapGrid, offsets: torch.Tensor, sensor_pose: torch.Tensor, scratch: Sequence[torch.Tensor] | None = None
-) -> torch.Tensor:
-    """Return the map cell under each cell of a window that is centred on, and turned with, the sensor.
-
-    Window row ``i`` lies at base-frame x = ``offsets[i]`` (forward as ``i`` grows), column ``j`` at base-frame
-    y = ``offsets[j]`` (to the left as ``j`` grows). A window cell takes the map cell that its centre lies in.
-
-    Args:
-        grid: The map's cells.
-        offsets: Window offsets as from :func:`window_offsets` [m], shape ``[W]``.
-        sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
-        scratch: Work space of three float tensors to overwrite, shape ``[N, W, W]``; None allocates it.
-
-    Returns:
-        Index into the flattened stored map, int64, shape ``[N, W, W]``; outside of the extent, that of a cell that is
-        always unseen. Aliases the work space.
-
-    Examples:
-        >>> grid = MapGrid(extent_x=(0.0, 0.4), extent_y=(0.0, 0.4), resolution=0.1)
-        >>> window_cells(grid, window_offsets(2, 0.1), torch.tensor([[0.2, 0.2, 0.0]])).tolist()
-        [[[33, 34], [49, 50]]]
-    """
-    ahead, left = offsets[:, None] / grid.resolution, offsets / grid.resolution
-    cos, sin = unit_vector(sensor_pose[:, 2, None, None])
-    start_x = (sensor_pose[:, 0, None, None] - grid.extent_x[0]) / grid.resolution
-    start_y = (sensor_pose[:, 1, None, None] - grid.extent_y[0]) / grid.resolution
-    j, column, i, cells = scratch or work_space((len(sensor_pose), len(offsets), len(offsets)), 3, offsets.device)
-    torch.add(start_y + sin * ahead, cos * left, out=j).floor_()
-    torch.clamp(j, 0, grid.num_y - 1, out=column)
-    # A column outside of the extent sends the row outside too: one index then tells all.
-    beyond = j.sub_(column).abs_()
-    torch.add(start_x + cos * ahead, -sin * left, out=i).floor_().clamp_(-1, grid.num_x)
-    row = i.sub_(beyond, alpha=grid.num_x + 1).clamp_(min=-1).add_(1)
-    return cells.copy_(column.add_(row, alpha=grid.num_columns))
-
-
-def outside_footprint(
-    offsets: torch.Tensor,
-    sensor_pose: torch.Tensor,
-    pose: torch.Tensor,
-    size: torch.Tensor,
-    scratch: Sequence[torch.Tensor] | None = None,
-) -> torch.Tensor:
-    """Tell which cells of the sensor's window have their centre outside of a rectangle.
-
-    Args:
-        offsets: Window offsets as from :func:`window_offsets` [m], shape ``[W]``.
-        sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
-        pose: Rectangle's centre (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
-        size: Rectangle's (length, width) [m], shape ``[N, 2]`` or ``[2]``.
-        scratch: Two float tensors to overwrite, shape ``[N, W, W]``; None allocates them.
-
-    Returns:
-        1 outside, 0 inside or on the edge, float32, shape ``[N, W, W]``; aliases the scratch.
-
-    Examples:
-        >>> sensor, box = torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0]])
-        >>> outside_footprint(window_offsets(2, 1.0), sensor, box, torch.ones(2)).tolist()
-        [[[1.0, 1.0], [1.0, 0.0]]]
-    """
-    yaw = sensor_pose[:, 2, None, None]
-    cos, sin = unit_vector(yaw)
-    shift_x, shift_y = (pose[:, :2] - sensor_pose[:, :2])[..., None, None].unbind(1)
-    ahead = offsets[:, None] - (shift_x * cos + shift_y * sin)
-    left = offsets - (shift_y * cos - shift_x * sin)
-    cos, sin = unit_vector(pose[:, 2, None, None] - yaw)
-    half = (size / 2)[..., None, None]
-    shape = (len(sensor_pose), len(offsets), len(offsets))
-    along, across = scratch or (offsets.new_empty(shape), offsets.new_empty(shape))
-    torch.add(cos * ahead, sin * left, out=along).abs_().sub_(half[..., 0, :, :])
-    torch.add(-sin * ahead, cos * left, out=across).abs_().sub_(half[..., 1, :, :])
-    return torch.maximum(along, across, out=along).sign_().relu_()

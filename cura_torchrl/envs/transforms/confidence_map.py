@@ -17,7 +17,7 @@ from torchrl.envs.transforms.utils import _get_reset
 
 from cura_torchrl import keys
 from cura_torchrl.envs.config import MapConfig, require
-from cura_torchrl.envs.sensors import visibility
+from cura_torchrl.envs.sensors import visibility, window
 from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.envs.sensors.visibility import MapGrid
 
@@ -26,11 +26,14 @@ if TYPE_CHECKING:
 
     from tensordict import NestedKey
 
-_CHUNK_CELLS = 2**18
-"""Cells processed at once: keeps the work space near the cache."""
+_CHUNK_CELLS = 5 * 2**15
+"""Cells processed at once on a CPU: keeps the work space in the cache."""
+
+_CHUNK_CELLS_ELSEWHERE = 2**25
+"""Cells processed at once on another device, where the number of kernels counts: bounds the work space."""
 
 _MAX_AGE = 2**16
-"""Age [steps] at which a cell stops decaying."""
+"""Age [steps] at which a cell's confidence is 0, whatever the decay."""
 
 
 class ConfidenceMap(Transform):
@@ -60,7 +63,7 @@ class ConfidenceMap(Transform):
 
     A reset forgets the rows that are reset and integrates their first scan; in the other rows the window that
     ``_reset`` returns is 0, for TorchRL keeps their old value. Rows never depend on one another. A range that is not a
-    number has seen nothing; a pose that is not a number raises ``RuntimeError``. Called as a module, outside of an
+    number has seen nothing; a pose that is not finite raises ``RuntimeError``. Called as a module, outside of an
     environment, the transform integrates one more scan; it is no transform for a replay buffer, whose samples are in no
     order. The time of a step grows with the cells of the extent.
 
@@ -113,24 +116,27 @@ class ConfidenceMap(Transform):
         self.num_rays = num_rays
         self.max_range = max_range
         self.grid = MapGrid(extent_x=config.extent_x, extent_y=config.extent_y, resolution=config.resolution)
-        offsets = visibility.window_offsets(config.window, config.resolution)
-        origin = torch.zeros(1, 3)
+        offsets = window.window_offsets(config.window, config.resolution)
+        origin, powers = torch.zeros(1, 3), _decay_powers(config.decay)
+        robot = window.footprint_frame(offsets, origin, origin, torch.tensor(robot_size))
         tables = {
             "_row_x": self.grid.row_x(),
             "_column_y": self.grid.column_y(),
             "_offsets": offsets,
             "_directions": torch.stack(visibility.unit_vector(ray_angles(num_rays))),
-            "_powers": _decay_powers(config.decay),
+            "_powers": powers[None],
             "_robot_size": torch.tensor(robot_size),
-            "_outside_robot": visibility.outside_footprint(offsets, origin, origin, torch.tensor(robot_size)),
+            # Times two, for what tells an obstacle from free space is half a step.
+            "_robot_mask": 2.0 - 2.0 * window.inside_footprint(robot.points(slice(None))),
         }
         for name, table in tables.items():
             self.register_buffer(name, table, persistent=False)
-        # +t: seen free in step t of the episode; -t: seen occupied in step t; 0: never seen. Whole, exact below 2**24.
+        # t: seen free at time t; t + 1/2: seen occupied at time t; 0: never seen. So the greatest one counts. Episodes
+        # begin at a time at which a cell never seen is older than the table of powers is long. Exact for 2**20 steps.
+        self._start = float(len(powers))
         self.register_buffer("_stamps", torch.zeros(0, self.grid.num_rows, self.grid.num_columns), persistent=False)
         self.register_buffer("_steps", torch.zeros(0), persistent=False)
-        self._map_space: tuple[torch.Tensor, ...] = ()
-        self._window_space: tuple[torch.Tensor, ...] = ()
+        self._map_space = self._window_space = torch.empty(0)
         self._batch_shape = torch.Size([])
 
     @property
@@ -170,10 +176,10 @@ class ConfidenceMap(Transform):
         if len(self._stamps) != num_rows or self._stamps.device != device:
             require(bool(mask.all()), "reset mask", mask.tolist(), "a whole reset where the batch or the device is new")
             self._stamps = torch.zeros(num_rows, *self._stamps.shape[1:], device=device)
-            self._steps = torch.zeros(num_rows, device=device)
+            self._steps = torch.full((num_rows,), self._start, device=device)
         rows = mask.nonzero().squeeze(-1)
         stamps = self._stamps.new_zeros(rows.numel(), *self._stamps.shape[1:])
-        steps = self._steps.new_zeros(rows.numel())
+        steps = self._steps.new_full((rows.numel(),), self._start)
         fresh = self._observe(stamps, steps, [item[rows] for item in inputs])
         self._stamps[rows], self._steps[rows] = stamps, steps
         window = fresh.new_zeros(num_rows, *fresh.shape[1:])
@@ -208,31 +214,39 @@ class ConfidenceMap(Transform):
         """Return the windows after one scan is integrated into ``stamps`` and ``steps``, in place."""
         steps += 1
         scan, pose = visibility.clean_scan(inputs[0], self.max_range), inputs[1]
-        if not self._map_space or self._map_space[0].device != scan.device:
+        torch._assert_async(pose.isfinite().all(), "a sensor's pose is out of bounds: accepted are finite numbers")
+        if self._map_space.numel() == 0 or self._map_space.device != scan.device:
             self._allocate(scan.device)
-        for rows, scratch in _chunks(len(scan), self._map_space):
-            free = visibility.seen_free(
-                self._row_x, self._column_y, scan[rows], pose[rows], self.grid.half_diagonal, scratch
-            )
-            torch.lerp(stamps[rows], steps[rows, None, None], free, out=stamps[rows])  # exact: the weights are 0 and 1
-        flat, now = stamps.flatten(1), steps[:, None]
-        self._mark_hits(flat, now, scan, inputs)
-        window = scan.new_empty(len(scan), self.num_channels, self.config.window, self.config.window)
+        view = visibility.view_scan(self._row_x, self._column_y, scan, pose, self.grid.half_diagonal)
+        hits = self._find_hits(scan, steps[:, None], inputs)
+        chunks = _chunks(len(scan), self._map_space)
+        for (rows, (scratch,)), part in zip(chunks, view.split(self._map_space.shape[1]), strict=True):
+            seen = visibility.free_margin(part, scratch).sign_().mul_(steps[rows, None, None])
+            maps = torch.maximum(stamps[rows], seen, out=stamps[rows]).flatten(1)
+            for cells, stamp in hits:
+                maps.scatter_(1, cells[rows], stamp[rows])
+        windows = scan.new_empty(len(scan), self.num_channels, self.config.window, self.config.window)
+        frames = [window.map_frame(self.grid, self._offsets, pose)]
+        if len(inputs) > 2:
+            frames.append(window.footprint_frame(self._offsets, pose, inputs[2], inputs[3]))
         for rows, scratch in _chunks(len(scan), self._window_space):
-            self._fill(window[rows], flat[rows], now[rows], [item[rows] for item in inputs], scratch)
-        return window
+            points = (frame.points(rows, scratch) for frame in frames)
+            self._fill(windows[rows], stamps[rows], steps[rows], points, scratch)
+        return windows
 
     def _allocate(self, device: torch.device) -> None:
+        num_cells = _CHUNK_CELLS if device.type == "cpu" else _CHUNK_CELLS_ELSEWHERE
         for name, shape, num_floats in (
             ("_map_space", (self.grid.num_rows, self.grid.num_columns), 1),
-            ("_window_space", (self.config.window, self.config.window), 3),
+            ("_window_space", (self.config.window, self.config.window), 2),
         ):
-            count = max(1, _CHUNK_CELLS // (shape[0] * shape[1]))
-            setattr(self, name, visibility.work_space((count, *shape), num_floats, device))
+            count = max(1, num_cells // (shape[0] * shape[1]))
+            setattr(self, name, torch.empty(num_floats, count, *shape, device=device))
 
-    def _mark_hits(
-        self, stamps: torch.Tensor, steps: torch.Tensor, scan: torch.Tensor, inputs: list[torch.Tensor]
-    ) -> None:
+    def _find_hits(
+        self, scan: torch.Tensor, steps: torch.Tensor, inputs: list[torch.Tensor]
+    ) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Return the cells to mark and their stamps: all hits as free, then the obstacles among them."""
         x, y = visibility.scan_points(scan, inputs[1], self._directions)
         cells, is_inside = visibility.cell_of_points(self.grid, x, y)
         # Half a cell below the maximum is five times the LiDAR's noise: a noisy miss is no obstacle.
@@ -242,33 +256,32 @@ class ConfidenceMap(Transform):
             is_obstacle &= ~visibility.inside_rectangle(x, y, inputs[2], inputs[3], margin=self.config.resolution)
         # What is not to be written goes to cell 0, outside of the extent, as the 0 that is there already. Obstacles
         # come second: a cell that holds the object and an obstacle is occupied, whatever the order of the rays.
-        stamps.scatter_(1, cells * is_hit, steps * is_hit)
-        stamps.scatter_(1, cells * is_obstacle, -steps * is_obstacle)
+        return [(cells * is_hit, steps * is_hit), (cells * is_obstacle, (steps + 0.5) * is_obstacle)]
 
     def _fill(
         self,
-        window: torch.Tensor,
+        windows: torch.Tensor,
         stamps: torch.Tensor,
         steps: torch.Tensor,
-        inputs: list[torch.Tensor],
-        scratch: list[torch.Tensor],
+        points: Iterator[torch.Tensor],
+        scratch: torch.Tensor,
     ) -> None:
-        cells = visibility.window_cells(self.grid, self._offsets, inputs[1], scratch)
-        stamp, last_seen, spare, age = scratch
-        torch.gather(stamps, 1, cells.flatten(1), out=stamp.flatten(1))
-        torch.abs(stamp, out=last_seen)
-        age.copy_(torch.sub(steps[..., None], last_seen, out=spare).clamp_(max=len(self._powers) - 1))
-        torch.index_select(self._powers, 0, age.view(-1), out=spare.view(-1))
-        torch.mul(spare, last_seen.clamp_(max=1.0), out=window[:, 0])
+        stamp = window.sample_map(self.grid, stamps, next(points))
+        last_seen, age = torch.floor(stamp, out=scratch[0]), scratch[1]
+        # The age as the coordinate of its power in the table.
+        scale = 2.0 / self._powers.shape[-1]
+        torch.add(((steps + 0.5) * scale - 1.0)[:, None, None], last_seen, alpha=-scale, out=age)
+        windows[:, 0] = visibility.sample_table(self._powers.expand(len(age), -1), age)
         if self.config.channels == "confidence":
             return
-        occupancy = stamp.clamp_(-1.0, 0.0).abs_().mul_(self._outside_robot)
-        if len(inputs) > 2:
-            occupancy.mul_(visibility.outside_footprint(self._offsets, inputs[1], inputs[2], inputs[3], scratch[1:3]))
+        occupancy = stamp.sub_(last_seen).mul_(self._robot_mask)
+        # What is left is the object's footprint, if there is one; its points overwrite the scratch.
+        for footprint in points:
+            occupancy.sub_(window.inside_footprint(footprint)).relu_()
         if self.config.channels == "product":
-            window[:, 0] *= occupancy
+            windows[:, 0] *= occupancy
         else:
-            window[:, 1] = occupancy
+            windows[:, 1] = occupancy
 
     def _read(self, tensordict: TensorDictBase) -> list[torch.Tensor]:
         # The inputs with one batch dimension; the batch's shape is noted.
@@ -293,17 +306,17 @@ class ConfidenceMap(Transform):
         return reset_keys[0]
 
 
-def _chunks(num_rows: int, space: tuple[torch.Tensor, ...]) -> Iterator[tuple[slice, list[torch.Tensor]]]:
+def _chunks(num_rows: int, space: torch.Tensor) -> Iterator[tuple[slice, torch.Tensor]]:
     # Slices of the batch that fit the work space, each with its part of it.
-    size = len(space[0])
+    size = space.shape[1]
     for start in range(0, num_rows, size):
         count = min(size, num_rows - start)
-        yield slice(start, start + count), [tensor[:count] for tensor in space]
+        yield slice(start, start + count), space[:, :count]
 
 
 def _decay_powers(decay: float) -> torch.Tensor:
     """Return ``decay ** k`` for ``k = 0, 1, ...`` until it is 0 in float32 or the greatest age is reached."""
     if decay <= 0.0:
         return torch.tensor([1.0, 0.0])
-    steps = 2 if decay >= 1.0 else min(_MAX_AGE, math.ceil(math.log(1e-46) / math.log(decay)))
+    steps = _MAX_AGE if decay >= 1.0 else min(_MAX_AGE, math.ceil(math.log(1e-46) / math.log(decay)))
     return torch.pow(torch.tensor(decay, dtype=torch.float64), torch.arange(steps + 1)).float()

@@ -12,18 +12,25 @@ from cura_torchrl.envs.sensors import (
     MapGrid,
     cell_of_points,
     clean_scan,
+    footprint_frame,
+    inside_footprint,
     inside_rectangle,
-    outside_footprint,
+    map_frame,
     ray_angles,
+    sample_map,
     scan_points,
     seen_free,
     unit_vector,
-    window_cells,
     window_offsets,
-    work_space,
 )
 
 GRID = MapGrid(extent_x=(-2.0, 2.0), extent_y=(-1.5, 1.5), resolution=0.1)
+
+
+def window_cells(offsets: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
+    """Return which cell of GRID each window cell shows, by its index in the flattened map; 0 outside of the extent."""
+    indices = torch.arange(float(GRID.num_rows * GRID.num_columns)).view(1, GRID.num_rows, GRID.num_columns)
+    return sample_map(GRID, indices, map_frame(GRID, offsets, pose).points(slice(None))).long()
 
 
 def place(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> torch.Tensor:
@@ -108,6 +115,28 @@ class TestSeenFree:
         bearing = np.degrees((np.arctan2(y, x) - yaw + math.pi) % (2 * math.pi) - math.pi)
         np.testing.assert_array_equal(free.numpy(), (bearing > -67.5) & (bearing < -22.5))
 
+    @pytest.mark.parametrize("num_rays", [1, 2, 7, 45])
+    def test_any_number_of_rays_has_its_sectors(self, num_rays: int) -> None:
+        """Catches tables of half a turn that hold for even numbers of rays only, or for many."""
+        scan, yaw = torch.rand(1, num_rays, generator=torch.Generator().manual_seed(0)) * 2.0, 0.4
+        free = seen_free(GRID.row_x(), GRID.column_y(), scan, place(0.013, 0.021, yaw), 0.0)[0, 1:41, :30]
+        x, y = np.meshgrid(
+            -2 + (np.arange(40) + 0.5) * 0.1 - 0.013, -1.5 + (np.arange(30) + 0.5) * 0.1 - 0.021, indexing="ij"
+        )
+        ray = np.round((np.arctan2(y, x) - yaw + math.pi) * num_rays / (2 * math.pi)).astype(int) % num_rays
+        np.testing.assert_array_equal(free.numpy(), np.hypot(x, y) < scan[0].numpy()[ray])
+
+    def test_rows_and_columns_through_the_sensor_have_their_bearings(self) -> None:
+        """Catches a quotient of two zeros, and 90 degrees taken for -90 on the row whose distance is zero."""
+        grid = MapGrid(extent_x=(-1.5, 1.5), extent_y=(-1.5, 1.5), resolution=1.0)  # centres at -1, 0, 1
+        # Rays at -180, -90, 0 and 90 degrees, of which one sees.
+        for ray, cell in enumerate([(0, 1), (1, 0), (2, 1), (1, 2)]):
+            scan = torch.zeros(1, 4)
+            scan[0, ray] = 1.2
+            free = seen_free(grid.row_x(), grid.column_y(), scan, place(), 0.0)[0, 1:-1, :3]
+            free[1, 1] = 0.0  # the sensor's own cell, whose bearing is a convention
+            assert free.nonzero().tolist() == [list(cell)]
+
     def test_a_sensor_in_a_cell_centre_sees_its_cell(self) -> None:
         """Catches a division by zero at the sensor itself."""
         free = seen_free(GRID.row_x(), GRID.column_y(), torch.ones(1, 8), place(0.05, 0.05), GRID.half_diagonal)[0]
@@ -125,8 +154,7 @@ class TestSeenFree:
     def test_work_space_changes_nothing(self) -> None:
         """Catches a result that depends on what the reused memory held."""
         scan, poses = torch.rand(3, 36) * 3, torch.rand(3, 3)
-        space = work_space((3, 42, 32), 1)
-        space[0].fill_(math.nan)
+        space = torch.full((3, 42, 32), math.nan)
         fresh = seen_free(GRID.row_x(), GRID.column_y(), scan, poses, GRID.half_diagonal)
         reused = seen_free(GRID.row_x(), GRID.column_y(), scan, poses, GRID.half_diagonal, space)
         assert torch.equal(fresh, reused)
@@ -147,12 +175,13 @@ class TestRectangles:
         """Catches a footprint that is computed in the wrong frame."""
         # Sensor at (1, 1) turned left by 90 degrees: the box centre (1, 3) is 2 m straight ahead of it.
         offsets = window_offsets(6, 1.0)  # -2.5 ... 2.5
-        outside = outside_footprint(
+        frame = footprint_frame(
             offsets, place(1.0, 1.0, math.pi / 2), place(1.0, 3.0, math.pi / 2), torch.tensor([1.2, 1.2])
         )
-        expected = torch.ones(6, 6)
-        expected[4:, 2:4] = 0.0  # rows at 1.5 and 2.5, columns at -0.5 and 0.5
-        assert torch.equal(outside[0], expected)
+        inside = inside_footprint(frame.points(slice(None)))
+        expected = torch.zeros(6, 6)
+        expected[4:, 2:4] = 1.0  # rows at 1.5 and 2.5, columns at -0.5 and 0.5
+        assert torch.equal(inside[0], expected)
 
 
 class TestWindow:
@@ -171,15 +200,15 @@ class TestWindow:
     def test_a_quarter_turn_turns_the_window(self, quarter: int) -> None:
         """Catches a mirrored window or a rotation by the wrong sign."""
         offsets = window_offsets(10, 0.1)
-        straight = window_cells(GRID, offsets, place(0.0, 0.0, 0.0))
-        turned = window_cells(GRID, offsets, place(0.0, 0.0, quarter * math.pi / 2))
+        straight = window_cells(offsets, place(0.0, 0.0, 0.0))
+        turned = window_cells(offsets, place(0.0, 0.0, quarter * math.pi / 2))
         # A quarter turn to the left: (ahead u, left v) is world (-v, u), so turned[i, j] = straight[W - 1 - j, i], or
         # torch.rot90 by -1: what was ahead (large i) is now to the right (small j).
         assert torch.equal(torch.rot90(straight, -quarter, (1, 2)), turned)
 
     def test_rows_look_ahead_and_columns_to_the_left(self) -> None:
         """Catches swapped axes."""
-        cells = window_cells(GRID, window_offsets(4, 0.1), place())[0]
+        cells = window_cells(window_offsets(4, 0.1), place())[0]
         rows, columns = cells // 32, cells % 32
         # x = 0.15 is in row 1 + floor(2.15 / 0.1) = 22, y = 0.15 in column floor(1.65 / 0.1) = 16.
         assert rows[:, 0].tolist() == [19, 20, 21, 22]
@@ -188,12 +217,12 @@ class TestWindow:
     @pytest.mark.parametrize("where", [(50.0, 0.0), (-50.0, 0.0), (0.0, 50.0), (0.0, -50.0), (1e4, 1e4), (500.0, 1.6)])
     def test_far_outside_shows_only_outside_cells(self, where: tuple[float, float]) -> None:
         """Catches an index that comes back into the map, from however far."""
-        cells = window_cells(GRID, window_offsets(10, 0.1), place(*where, 0.3))
+        cells = window_cells(window_offsets(10, 0.1), place(*where, 0.3))
         assert torch.isin(cells // 32, torch.tensor([0, 41])).all()
 
     def test_half_outside_shows_both(self) -> None:
         """Catches a clamp that repeats the map's edge."""
-        cells = window_cells(GRID, window_offsets(10, 0.1), place(0.0, 1.5, 0.0))[0]
+        cells = window_cells(window_offsets(10, 0.1), place(0.0, 1.5, 0.0))[0]
         rows = cells // 32
         assert (rows[:, :5] >= 1).all()
         assert (rows[:, :5] <= 40).all()

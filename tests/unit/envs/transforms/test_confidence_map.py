@@ -213,8 +213,26 @@ class TestScenes:
         """Catches a NaN that reads as free space."""
         data = scan_of([]).set("scan", torch.full((1, NUM_RAYS), math.nan))
         assert make_map(object_keys=None)(data)["confidence_map"].sum() == 0.0
-        with pytest.raises(RuntimeError, match="out of bounds"):
-            make_map(object_keys=None)(scan_of([]).set("sensor_pose", torch.full((1, 3), math.nan)))
+        for bad in (math.nan, math.inf):
+            with pytest.raises(RuntimeError, match="out of bounds"):
+                make_map(object_keys=None)(scan_of([]).set("sensor_pose", torch.full((1, 3), bad)))
+
+    def test_an_object_seen_between_free_steps_is_an_obstacle_only_then(self) -> None:
+        """Catches an order of stamps in which a later free observation does not outdo an earlier obstacle."""
+        transform, wall = make_map(object_keys=None), scan_of([(1.5, 0.0, 0.0, 0.4, 0.4)])
+        expected = [False, True, True, False, True]
+        for scan, is_occupied in zip((scan_of([]), wall, wall, scan_of([]), wall), expected, strict=True):
+            assert bool(transform(scan.clone())["confidence_map"][0, 1].any()) == is_occupied
+
+    def test_accumulated_confidence_outlasts_an_episode(self) -> None:
+        """Catches a table of powers that ends early where nothing decays."""
+        config = MapConfig(extent_x=CONFIG.extent_x, extent_y=CONFIG.extent_y, window=40, decay=1.0)
+        transform = make_map(config, object_keys=None)
+        seen = transform(scan_of([]))["confidence_map"][0, 0]
+        transform._steps += 5000.0
+        later = transform(scan_of([]).set("scan", torch.zeros(1, NUM_RAYS)))["confidence_map"][0, 0]
+        assert torch.equal(later, seen)
+        assert seen.any()
 
 
 class TestState:
