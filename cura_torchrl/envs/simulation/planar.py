@@ -50,7 +50,6 @@ class PlanarWorlds:
     ) -> None:
         self.num_worlds = num_worlds
         self._dynamics, self._shape, self._period = dynamics, shape, physics.planar_period
-        self._device = device
 
         def zeros(*size: int) -> torch.Tensor:
             return torch.zeros(num_worlds, *size, dtype=torch.float64, device=device)
