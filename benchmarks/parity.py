@@ -56,7 +56,10 @@ def batches(total: int, rows: int, what: str) -> Iterator[tuple[int, int]]:
 def spread(values: torch.Tensor) -> dict[str, float]:
     """Return the quantiles of some values."""
     points = torch.tensor(QUANTILES, dtype=torch.float64)
-    return {f"q{round(100 * q)}": round(v.item(), 5) for q, v in zip(QUANTILES, values.double().quantile(points), strict=True)}
+    return {
+        f"q{round(100 * q)}": round(v.item(), 5)
+        for q, v in zip(QUANTILES, values.double().quantile(points), strict=True)
+    }
 
 
 def compare_scans(scenes: int, rows: int) -> dict[str, float]:
@@ -78,7 +81,16 @@ def compare_scans(scenes: int, rows: int) -> dict[str, float]:
 def replay(
     envs: list[PushEnv], act: Callable[[TensorDictBase, int], torch.Tensor], steps: int
 ) -> list[list[dict[str, torch.Tensor]]]:
-    """Play on PyBullet, then the same actions on the planar simulator; return the states after every step."""
+    """Play on PyBullet, then the same actions on the planar simulator.
+
+    Args:
+        envs: One environment a simulator.
+        act: Chooses PyBullet's actions from its tensordict and the number of the step.
+        steps: Policy steps.
+
+    Returns:
+        States after every step, by simulator.
+    """
     bullet, planar = envs
     actions: list[torch.Tensor] = []
 
@@ -229,7 +241,9 @@ def main() -> None:
         "free_motion": compare_free_motion(options.scenes, options.rows),
         "scripted_pushes": compare_pushing(options.scenes, options.rows, "scripted"),
         "random_pushes": compare_pushing(options.scenes, options.rows, "random"),
-        "closed_loop": {str(edge): compare_closed_loop(options.scenes, options.rows, edge) for edge in (0.5, 0.75, 1.0)},
+        "closed_loop": {
+            str(edge): compare_closed_loop(options.scenes, options.rows, edge) for edge in (0.5, 0.75, 1.0)
+        },
     }
     text = json.dumps(report, indent=2)
     sys.stdout.write(text + "\n")

@@ -10,8 +10,8 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from cura_torchrl import keys
-from cura_torchrl.envs.config import PushEnvConfig
 from cura_torchrl.envs import geometry
+from cura_torchrl.envs.config import PushEnvConfig
 from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE, observe
 from cura_torchrl.envs.mdp.rewards import REWARD_TERM_NAMES, reward_terms

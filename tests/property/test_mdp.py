@@ -8,8 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cura_torchrl.envs.config import RewardConfig, ScenarioConfig
 from cura_torchrl.envs import geometry
+from cura_torchrl.envs.config import RewardConfig, ScenarioConfig
 from cura_torchrl.envs.mdp import rewards
 from cura_torchrl.envs.mdp.scenarios import sample_scenarios
 

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from cura_torchrl.envs.config import require
 from cura_torchrl.envs import geometry
+from cura_torchrl.envs.config import require
 
 if TYPE_CHECKING:
     from cura_torchrl.envs.config import ScenarioConfig, Stream

@@ -229,4 +229,3 @@ def hand_rotation(yaw: torch.Tensor, tilt: float) -> torch.Tensor:
     axis = torch.stack([pitch.cos() * yaw.cos(), pitch.cos() * yaw.sin(), -pitch.sin()], dim=-1)
     fingers = torch.stack([yaw.sin(), -yaw.cos(), zero], dim=-1)
     return torch.stack([torch.cross(fingers, axis, dim=-1), fingers, axis], dim=-1)
-

@@ -90,7 +90,8 @@ class RobotDynamics:
         carried = [_from_the_tip(part) for part in (bodies.mass, bodies.moment, bodies.tensor)]
         whole = [part[:, :1] + own for part, own in zip(carried, _fields(self._base), strict=True)]
         mass, moment, tensor = (
-            torch.cat([part.expand(-1, 3, *part.shape[2:]), arm], dim=1) for part, arm in zip(whole, carried, strict=True)
+            torch.cat([part.expand(-1, 3, *part.shape[2:]), arm], dim=1)
+            for part, arm in zip(whole, carried, strict=True)
         )
         axis = rotation[..., 2]  # every arm joint turns about its frame's z axis
         arm_twists = torch.cat([axis, torch.cross(position, axis, dim=-1)], dim=-1)

@@ -8,8 +8,8 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from cura_torchrl import keys
-from cura_torchrl.envs.config import RobotConfig
 from cura_torchrl.envs import geometry
+from cura_torchrl.envs.config import RobotConfig
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.robots import route
 

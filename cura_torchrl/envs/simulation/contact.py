@@ -13,7 +13,7 @@ import torch
 _FACE_BIAS = 1e-3
 """How much deeper a face of the first rectangle must lie to take the second one's place as the reference [m].
 
-Without it the reference, and with it the contact points, would jump to and fro between two parallel faces.
+Without it the reference, and with it the contact points, would jump back and forth between two parallel faces.
 """
 
 

@@ -12,13 +12,13 @@ import torch
 
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.simulation.contact import Rectangle, overlap
-from cura_torchrl.envs.simulation.interface import SimulationError, WorldState
-from cura_torchrl.envs.simulation.pushing import Cube, Pushers, PushContact
+from cura_torchrl.envs.simulation.interface import HandLinearization, SimulationError, WorldState
+from cura_torchrl.envs.simulation.pushing import Cube, PushContact, Pushers
 from cura_torchrl.envs.simulation.rays import free_share
 
 if TYPE_CHECKING:
     from cura_torchrl.envs.config import PhysicsConfig
-    from cura_torchrl.envs.simulation.interface import HandLinearization, RobotShape, SceneState, TorqueLaw
+    from cura_torchrl.envs.simulation.interface import RobotShape, SceneState, TorqueLaw
 
 
 class Dynamics(Protocol):
@@ -58,18 +58,14 @@ class PlanarWorlds:
         self._inertia = torch.eye(10, dtype=torch.float64, device=device).expand(num_worlds, 10, 10)
         self._inverse_inertia = zeros(10, 10)
         self._cube = Cube(zeros(3), zeros(3), zeros() + 1.0, zeros() + 1.0, zeros() + 1.0, zeros(3))
-        self._pushing = PushContact(
-            num_worlds, 2, period=self._period, gravity=physics.gravity, pusher_friction=physics.hand_friction,
-            sweeps=physics.planar_sweeps, correction=physics.planar_correction,
-            creep=physics.planar_creep, device=device,
-        )  # fmt: skip
+        self._pushing = PushContact(num_worlds, 2, physics, device)
         self._half = torch.tensor([shape.hand_size, shape.chassis_size], dtype=torch.float64, device=device) / 2
         self._obstacle_pose, self._obstacle_edge = zeros(0, 3), zeros(0)
         self._contact = torch.zeros(num_worlds, 3, dtype=torch.bool, device=device)
         self._jacobian = zeros(2, 4, 10)
         self._jacobian[:, 1, [0, 1, 3], [0, 1, 2]] = 1.0  # the chassis: the base's own velocity
         self._flat_jacobian, self._mobility = zeros(8, 10), zeros(4, 4, 2)
-        self._hand: HandLinearization | None = None
+        self._hand = HandLinearization(zeros(3), zeros(3, 3), zeros(6, 7), reference=zeros(7))
         self._hand_yaw, self._hand_front = zeros(), zeros()
 
     def close(self) -> None:
@@ -173,9 +169,6 @@ class PlanarWorlds:
     def _hand_pose(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the TCP in the world [m] ``[N, 3]``, and the yaw of the hand's axis in the world [rad] ``[N]``."""
         hand = self._hand
-        if hand is None:
-            msg = "the worlds have not been advanced; accepted: advance() before asking for the hand"
-            raise RuntimeError(msg)
         change = self._position[:, 3:] - hand.reference
         moved = (hand.jacobian[:, [0, 1, 2, 5]] @ change[..., None])[..., 0]
         tcp = hand.tcp + moved[:, :3]
@@ -213,7 +206,9 @@ class PlanarWorlds:
         length, width = self._half[1].expand(len(base), 2).T
         arm_width = torch.full_like(yaw, shape.arm_half_width)
         half = self._cube.edge / 2
-        halves = torch.stack([torch.stack([length, geometry.norm(arm) / 2, half]), torch.stack([width, arm_width, half])])
+        halves = torch.stack(
+            [torch.stack([length, geometry.norm(arm) / 2, half]), torch.stack([width, arm_width, half])]
+        )
         obstacle_half = self._obstacle_edge / 2
         touches = overlap(
             _rectangle(poses, halves[0, ..., None], halves[1, ..., None]),

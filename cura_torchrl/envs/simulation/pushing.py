@@ -8,10 +8,14 @@ component is a tensor of its own, worlds last.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 
 from cura_torchrl.envs.simulation.contact import Rectangle, rectangle_manifold
+
+if TYPE_CHECKING:
+    from cura_torchrl.envs.config import PhysicsConfig
 
 _CORNER_MASS = 1.0 / 14.0
 """Impulse per velocity of a corner in one sweep [cube masses].
@@ -75,12 +79,7 @@ class PushContact:
     Args:
         num_worlds: Number of worlds N.
         num_pushers: Pushers B in each.
-        period: Length of a tick [s].
-        gravity: Weight per mass [m/s^2].
-        pusher_friction: Friction of the pushers, multiplied by the cube's as Bullet does [1].
-        sweeps: Gauss-Seidel sweeps a tick.
-        correction: Share of an overlap that is taken back in a tick [1].
-        creep: Slip speed of a pusher that sticks, for tangential force over normal force over friction squared [m/s].
+        physics: Clock, weight, friction, and the fields that begin with ``planar``.
         device: Where the tensors live.
 
     Source:
@@ -89,20 +88,9 @@ class PushContact:
     """
 
     def __init__(
-        self,
-        num_worlds: int,
-        num_pushers: int,
-        *,
-        period: float,
-        gravity: float,
-        pusher_friction: float,
-        sweeps: int,
-        correction: float,
-        creep: float,
-        device: torch.device | None = None,
+        self, num_worlds: int, num_pushers: int, physics: PhysicsConfig, device: torch.device | None = None
     ) -> None:
-        self._period, self._gravity, self._pusher_friction = period, gravity, pusher_friction
-        self._sweeps, self._correction, self._creep = sweeps, correction, creep
+        self._physics, self._period = physics, physics.planar_period
 
         def zeros(*shape: int) -> torch.Tensor:
             return torch.zeros(*shape, num_worlds, dtype=torch.float64, device=device)
@@ -121,7 +109,7 @@ class PushContact:
         """
         self._floor_impulse[..., rows] = 0.0
         self._impulse[..., rows] = 0.0
-        self._load[:, rows] = (cube.mass * self._gravity / 4)[rows]
+        self._load[:, rows] = (cube.mass * self._physics.gravity / 4)[rows]
 
     def solve(self, cube: Cube, pushers: Pushers) -> torch.Tensor:
         """Change the cubes' twists by the impulses of one tick.
@@ -135,17 +123,13 @@ class PushContact:
         """
         footprint = _Footprint(cube, self._signs)
         floor = _Floor(cube, footprint, cube.friction * self._load * self._period)
-        touch = _Touch(
-            cube, footprint, pushers, self._pusher_friction * cube.friction,
-            correction_rate=self._correction / self._period, creep=self._creep,
-        )  # fmt: skip
-        touch.allow(self._period)
+        touch = _Touch(cube, footprint, pushers, self._physics)
         twist, pusher_twist = cube.twist.T.contiguous(), pushers.twist
         twist = floor.push(twist, self._floor_impulse)
         points: list[torch.Tensor] = list(self._impulse)
         for point, impulse in enumerate(points):
             twist, pusher_twist = touch.push(point, twist, pusher_twist, impulse)
-        for _ in range(self._sweeps):
+        for _ in range(self._physics.planar_sweeps):
             rubbed = floor.impulse(self._floor_impulse, twist)
             twist = floor.push(twist, rubbed - self._floor_impulse)
             self._floor_impulse = rubbed
@@ -166,7 +150,7 @@ class PushContact:
         lift_x, lift_y = ((lever * lift).sum((0, 1)) for lever in touch.levers)
         moment_x = (above * level_x.sum(0)).sum(0) - com_height * rub_x - lift_x
         moment_y = (above * level_y.sum(0)).sum(0) - com_height * rub_y - lift_y
-        total = (cube.mass * self._gravity - lift.sum((0, 1)) / self._period).clamp_min(0.0)
+        total = (cube.mass * self._physics.gravity - lift.sum((0, 1)) / self._period).clamp_min(0.0)
         about_x = moment_x / self._period + footprint.offset_x * total
         about_y = moment_y / self._period + footprint.offset_y * total
         share = (footprint.corner_x * about_x + footprint.corner_y * about_y) / cube.edge**2
@@ -210,16 +194,7 @@ class _Floor:
 class _Touch:
     """Contact of the pushers with the cube in one tick. Impulses at a point ``[3, B, N]``: normal, left, up."""
 
-    def __init__(
-        self,
-        cube: Cube,
-        footprint: _Footprint,
-        pushers: Pushers,
-        friction: torch.Tensor,
-        *,
-        correction_rate: float,
-        creep: float,
-    ) -> None:
+    def __init__(self, cube: Cube, footprint: _Footprint, pushers: Pushers, physics: PhysicsConfig) -> None:
         rectangle = footprint.rectangle
         self._contact = contact = rectangle_manifold(pushers.rectangle, _expanded(rectangle, pushers.height))
         self._x, self._y = contact.normal_x, contact.normal_y
@@ -227,14 +202,17 @@ class _Touch:
         far_x, far_y = contact.x - pushers.anchor[0], contact.y - pushers.anchor[1]
         self.levers = own_x, own_y  # from the cube's centre of mass [m], [2, B, N]
         self._far = far_x, far_y  # from the pusher's anchor
-        self._friction, self._mobility, self._correction_rate = friction, pushers.mobility, correction_rate
+        self._friction, self._mobility = physics.hand_friction * cube.friction, pushers.mobility
         self._inverse_mass, self._inverse_inertia = 1 / cube.mass, 1 / cube.inertia
         # Pushers are swept at once: where several touch, each takes its share of the cube's mass.
         sharing = (contact.gap < _TOUCHING).any(0).sum(0).clamp_min(1)
         along = self._answer(self._x, self._y, sharing)
         beside = torch.maximum(self._answer(-self._y, self._x, sharing), pushers.mobility[2, 2])
         self._normal_step, self._tangent_weight = 1 / along, beside
-        self._creep = creep / friction**2
+        self._creep = physics.planar_creep / self._friction**2
+        # The least rate at which a gap has to open [m/s]: negative where there is room to close.
+        rate = torch.where(contact.gap > 0, -contact.gap, -physics.planar_correction * contact.gap)
+        self._least_rate = (rate / physics.planar_period).clamp_min(-1e6)
 
     def _answer(self, x: torch.Tensor, y: torch.Tensor, sharing: torch.Tensor) -> torch.Tensor:
         """Return the change of relative velocity along a direction for an impulse along it [1/kg], ``[2, B, N]``."""
@@ -243,11 +221,6 @@ class _Touch:
         level = mobility[0, 0] * x * x + 2 * mobility[0, 1] * x * y + mobility[1, 1] * y * y
         turning = 2 * lever * (mobility[0, 3] * x + mobility[1, 3] * y) + mobility[3, 3] * lever * lever
         return sharing * (self._inverse_mass + self._inverse_inertia * arm * arm) + level + turning
-
-    def allow(self, period: float) -> None:
-        """Set the least rate at which gaps must open [m/s]: negative where there is room to close."""
-        gap = self._contact.gap
-        self._least_rate = torch.where(gap > 0, -gap / period, -self._correction_rate * gap).clamp_min(-1e6)
 
     def impulse(
         self, point: int, impulse: torch.Tensor, twist: torch.Tensor, pusher_twist: torch.Tensor

@@ -41,7 +41,8 @@ def free_share(origin: torch.Tensor, ends: torch.Tensor, pose: torch.Tensor, hal
     direction = (ends - origin[:, None]).float()
     rows = max(1, _CHUNK // max(1, direction.shape[1] * half.shape[1]))
     shares = [
-        _nearest(part, *piece.unbind(-1)) for part, piece in zip(parts.split(rows, 1), direction.split(rows), strict=True)
+        _nearest(part, *piece.unbind(-1))
+        for part, piece in zip(parts.split(rows, 1), direction.split(rows), strict=True)
     ]
     return torch.cat(shares).to(ends.dtype)
 

@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
-from cura_torchrl.envs.config import RewardConfig
 from cura_torchrl.envs import geometry
+from cura_torchrl.envs.config import RewardConfig
 from cura_torchrl.envs.mdp import rewards
 
 CONFIG = RewardConfig()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from cura_torchrl.envs.config import ScenarioConfig
 from cura_torchrl.envs import geometry
+from cura_torchrl.envs.config import ScenarioConfig
 from cura_torchrl.envs.mdp.scenarios import sample_scenarios, spawn_obstacles
 
 if TYPE_CHECKING:

@@ -7,10 +7,11 @@ import math
 import pytest
 import torch
 
+from cura_torchrl.envs.config import PhysicsConfig
 from cura_torchrl.envs.simulation.contact import Rectangle
 from cura_torchrl.envs.simulation.pushing import Cube, PushContact, Pushers
 
-DT, GRAVITY = 0.005, 9.81
+DT, GRAVITY = 0.005, PhysicsConfig().gravity
 KINEMATIC = 1e-9
 """Mobility of a pusher that nothing slows down."""
 
@@ -20,7 +21,9 @@ def tensor(values: object) -> torch.Tensor:
     return torch.as_tensor(values, dtype=torch.float64)
 
 
-def make_cube(rows: int = 1, *, edge: float = 0.5, mass: float = 5.0, friction: float = 0.4, **overrides: object) -> Cube:
+def make_cube(
+    rows: int = 1, *, edge: float = 0.5, mass: float = 5.0, friction: float = 0.4, **overrides: object
+) -> Cube:
     """Return cubes at the origin, at rest; ``pose``, ``twist`` and ``com_offset`` may be given."""
     values = {name: tensor(overrides.get(name, [[0.0] * 3])).expand(rows, 3).clone() for name in
               ("pose", "twist", "com_offset")}  # fmt: skip
@@ -32,7 +35,8 @@ def make_cube(rows: int = 1, *, edge: float = 0.5, mass: float = 5.0, friction: 
 def make_contact(cube: Cube, creep: float = 0.0) -> PushContact:
     """Return the contact of one pusher a world."""
     rows = len(cube.mass)
-    contact = PushContact(rows, 1, period=DT, gravity=GRAVITY, pusher_friction=1.5, sweeps=4, correction=0.2, creep=creep)
+    physics = PhysicsConfig(planar_period=DT, planar_sweeps=4, planar_creep=creep)
+    contact = PushContact(rows, 1, physics)
     contact.reset(torch.arange(rows), cube)
     return contact
 
@@ -84,7 +88,9 @@ def test_a_spinning_cube_stops_as_its_corners_rub():
     assert cube.twist.abs().max() < 1e-3
 
 
-def push(cube: Cube, velocity: tuple[float, float], seconds: float, start: tuple[float, float], **options: float) -> torch.Tensor:
+def push(
+    cube: Cube, velocity: tuple[float, float], seconds: float, start: tuple[float, float], **options: float
+) -> torch.Tensor:
     """Push with a hand of constant velocity; return where it ends, ``[N, 2]``."""
     contact = make_contact(cube, creep=options.pop("creep", 0.0))
     place = tensor(start).expand(len(cube.mass), 2).clone()

@@ -40,7 +40,9 @@ def test_any_scene_is_seen_as_geometry_says():
 def test_a_square_without_size_is_not_there():
     """Catches the ghost of an obstacle that has not appeared yet."""
     pose = torch.zeros(1, 3, dtype=torch.float64)
-    assert (scan(pose, torch.tensor([[[3.0, 0.0, 0.3, 0.0], [0.0, 0.0, 0.0, 0.0]]], dtype=torch.float64)) == RANGE).all()
+    assert (
+        scan(pose, torch.tensor([[[3.0, 0.0, 0.3, 0.0], [0.0, 0.0, 0.0, 0.0]]], dtype=torch.float64)) == RANGE
+    ).all()
 
 
 def test_a_square_around_the_sensor_and_one_behind_are_not_seen():
