@@ -313,9 +313,9 @@ class PhysicsConfig:
     """Bullet's friction of the robot's links; Bullet multiplies it by the object's [1]."""
     solver_iterations: int = 50
     """Bullet's constraint solver iterations per tick [1]."""
-    planar_period: float = 0.01
-    """Time step of control and physics in the planar simulator [s]; at half the rate its paths are the same."""
-    planar_sweeps: int = 3
+    planar_period: float = 0.02
+    """Time step of control and physics in the planar simulator [s]; a shorter one hardly changes its paths."""
+    planar_sweeps: int = 2
     """Gauss-Seidel sweeps over the planar simulator's contacts per tick [1]."""
     planar_correction: float = 0.2
     """Share of an overlap that the planar simulator takes back in a tick; Bullet's default [1]."""

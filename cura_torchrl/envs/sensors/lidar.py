@@ -39,9 +39,12 @@ def ray_ends(pose: torch.Tensor, config: LidarConfig) -> torch.Tensor:
     Returns:
         End points in the world frame [m], shape ``[B, R, 3]``.
     """
-    angle = (ray_angles(config.num_rays, pose.device) + pose[:, 2:3]).contiguous()
-    x = pose[:, 0:1] + config.max_range * angle.cos()
-    y = pose[:, 1:2] + config.max_range * angle.sin()
+    # Turned by the angle addition theorem: a sine and a cosine a sensor in place of one a ray.
+    angle, yaw = ray_angles(config.num_rays, pose.device), pose[:, 2:3]
+    ahead, left = config.max_range * yaw.cos(), config.max_range * yaw.sin()
+    cos, sin = angle.cos(), angle.sin()
+    x = pose[:, 0:1] + (ahead * cos - left * sin)
+    y = pose[:, 1:2] + (left * cos + ahead * sin)
     return torch.stack([x, y, torch.full_like(x, config.height)], dim=-1)
 
 
