@@ -1,7 +1,7 @@
 """Print how the success rates of the same policies on the same scenes differ between the two simulators, as Markdown.
 
-Reads what ``evaluate --json`` printed: python benchmarks/compare_simulators.py benchmarks/results/bullet \\
-benchmarks/results/planar
+Reads what ``evaluate --json`` printed:
+python benchmarks/compare_simulators.py benchmarks/results/bullet benchmarks/results/planar
 """
 
 from __future__ import annotations

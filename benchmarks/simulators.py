@@ -46,7 +46,17 @@ def play(simulator: Simulator, num_envs: int, steps: int) -> float:
 
 
 def play_in_processes(pool: ProcessPoolExecutor, workers: int, num_envs: int, steps: int) -> float:
-    """Play on PyBullet in several processes at once; return the steps a second of all together."""
+    """Play on PyBullet in several processes at once.
+
+    Args:
+        pool: The processes.
+        workers: How many there are.
+        num_envs: Worlds in each.
+        steps: Policy steps.
+
+    Returns:
+        Environment steps a second of all together.
+    """
     seconds = list(pool.map(play, ["bullet"] * workers, [num_envs] * workers, [steps] * workers))
     return workers * num_envs * steps / max(seconds)
 
