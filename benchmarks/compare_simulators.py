@@ -59,9 +59,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs=2, help="results on PyBullet, results on the planar simulator")
     bullet, planar = (read(folder) for folder in parser.parse_args().folders)
-    print(
-        "| Policies and scenes | PyBullet [%] (episodes) | planar [%] (episodes) | difference [points] (95 % interval) |"
-    )
+    print("| Policy, size | PyBullet [%] (episodes) | planar [%] (episodes) | difference [points] (95 % interval) |")
     print("|---|---|---|---|")
     shared = [key for key in bullet if key in planar]
     for method in sorted({key[0] for key in shared}):
