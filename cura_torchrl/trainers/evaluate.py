@@ -85,7 +85,8 @@ def summarise(episodes: list[Episode]) -> dict[str, Any]:
         episodes: What was played, at least one.
 
     Returns:
-        Counts, success rates for the three tolerances, Wilson's interval of the headline, mean steps to the outcome.
+        Counts, success rates for the three tolerances, Wilson's interval of the headline, mean steps to the outcome;
+        the outcomes by index of the scenario (s: success, c: collision, t: time-out), to pair them with other results.
     """
     count = len(episodes)
     successes = sum(episode.success[0] for episode in episodes)
@@ -102,12 +103,17 @@ def summarise(episodes: list[Episode]) -> dict[str, Any]:
         "success_rate_025": sum(episode.success[1] for episode in episodes) / count,
         "success_rate_010_10deg": sum(episode.success[2] for episode in episodes) / count,
         "mean_steps": sum(episode.steps for episode in episodes) / count,
+        "outcomes": "".join(_outcome(episode) for episode in sorted(episodes, key=lambda episode: episode.index)),
         "tipped": sum(episode.tipped for episode in episodes),
         "collisions_by": {
             name: sum(episode.contact[index] for episode in collisions)
             for index, name in enumerate(("base", "arm", "object"))
         },
     }
+
+
+def _outcome(episode: Episode) -> str:
+    return "s" if episode.success[0] else "c" if episode.collision else "t"
 
 
 class Player:

@@ -31,15 +31,16 @@ def test_outcomes_add_up_to_the_episodes() -> None:
     """Catches an episode that is both a success and a collision, or neither nor a time-out."""
     result = summarise(
         [
-            episode(0, success=(True, True, False)),
-            episode(1, success=(True, False, False)),
-            episode(2, collision=True),
             episode(3),
+            episode(1, success=(True, False, False)),
+            episode(0, success=(True, True, False)),
+            episode(2, collision=True),
         ]
     )
     assert (result["successes"], result["collisions"], result["timeouts"], result["episodes"]) == (2, 1, 1, 4)
     assert (result["success_rate"], result["success_rate_025"], result["success_rate_010_10deg"]) == (0.5, 0.25, 0.0)
     assert result["collisions_by"] == {"base": 0, "arm": 0, "object": 1}
+    assert result["outcomes"] == "ssct"  # by the scenario's index, in whatever order they ended
     # Wilson for 2 of 4, z^2 = 3.841459: centre 0.5, half width 1.959964 sqrt(0.0625 + 0.060023) / 1.960365 = 0.34996
     assert (result["wilson_low"], result["wilson_high"]) == pytest.approx((0.150039, 0.849961), abs=1e-5)
 
