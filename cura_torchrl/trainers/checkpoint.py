@@ -240,9 +240,9 @@ class LoadedPolicy:
         """
         played = self.config.env.task if task is None else task
         played = dataclasses.replace(played, stream="eval", random_first_age=False, curriculum=())
-        config = self.config.replace(
-            env=dataclasses.replace(self.config.env, task=played), simulator=simulator or self.config.simulator
-        )
+        where = simulator or self.config.simulator
+        env = dataclasses.replace(self.config.env, task=played, simulator=where)
+        config = self.config.replace(env=env, simulator=where)
         return make_env(config, num_envs, keep_map=keep_map, **options)
 
 

@@ -217,7 +217,11 @@ class TrainConfig:
             self.checkpoint_minutes,
             "a time that is not negative [min]",
         )
-        object.__setattr__(self, "env", dataclasses.replace(self.env, simulator=self.simulator))
+        if self.env.simulator == PushEnvConfig().simulator:
+            object.__setattr__(self, "env", dataclasses.replace(self.env, simulator=self.simulator))
+        require(
+            self.env.simulator == self.simulator, "env.simulator", self.env.simulator, f"simulator {self.simulator!r}"
+        )
 
     @property
     def frames_per_batch(self) -> int:

@@ -196,6 +196,18 @@ def test_exported_weights_load_by_path_and_act_alike(tmp_path: Path) -> None:
     verify(loaded.path)
 
 
+def test_a_policy_plays_on_either_simulator_whatever_it_was_trained_on(tmp_path: Path) -> None:
+    """Catches an evaluation that plays where the policy was trained, not where it was asked to."""
+    config = method("push").replace(run_dir=tmp_path / "run", perception="none", simulator="planar")
+    save_checkpoint({"networks": Networks(config)}, config, tmp_path / "run", frames=1)
+    loaded = load_policy(tmp_path / "run")
+    for asked, played in ((None, "planar"), ("bullet", "bullet"), ("planar", "planar")):
+        env = loaded.make_env(1, simulator=asked)
+        assert env.base_env.config.simulator == played
+        assert env.base_env.config.task.stream == "eval"
+        env.close()
+
+
 def _outputs(value: torch.Tensor | tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
     return value if isinstance(value, tuple) else (value,)
 

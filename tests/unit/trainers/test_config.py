@@ -95,6 +95,9 @@ def test_a_whole_number_is_accepted_where_a_number_is_due() -> None:
 def test_the_simulator_is_told_once() -> None:
     """Catches a run whose environment uses another simulator than its configuration says."""
     assert TrainConfig().env.simulator == TrainConfig().simulator == PushEnvConfig().simulator
+    assert TrainConfig(simulator="planar").env.simulator == "planar"
+    with pytest.raises(ValueError, match=r"^env.simulator is 'planar'; accepted: simulator 'bullet'$"):
+        TrainConfig(env=PushEnvConfig(simulator="planar"))
 
 
 @pytest.mark.parametrize(
