@@ -12,6 +12,7 @@ import shlex
 import sys
 import time
 from collections import defaultdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -63,6 +64,7 @@ def main() -> None:
     parser.add_argument("--num-envs", type=int, default=1024, help="environments [1]")
     parser.add_argument("--steps", type=int, default=24, help="steps of a rollout in each of them [1]")
     parser.add_argument("--minibatch-size", type=int, default=2048, help="samples of a gradient step [1]")
+    parser.add_argument("--output", type=Path, help="file for the figures; PyBullet greets on standard output")
     options = parser.parse_args()
     base = method("cura-ppo")
     ppo = base.ppo.__class__(rollout_steps=options.steps, minibatch_size=options.minibatch_size)
@@ -102,7 +104,10 @@ def main() -> None:
         "seconds": {part: round(value, 3) for part, value in sorted(watch.seconds.items(), key=lambda item: -item[1])},
         "share": {part: round(value / total, 3) for part, value in watch.seconds.items()},
     }
-    print(json.dumps(report, indent=2))
+    text = json.dumps(report, indent=2)
+    print(text)
+    if options.output is not None:
+        options.output.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import statistics
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
 import torch
 
@@ -73,6 +74,7 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=32, help="PyBullet worlds in each of them [1]")
     parser.add_argument("--rounds", type=int, default=3, help="how often both are measured [1]")
     parser.add_argument("--steps", type=int, default=20, help="policy steps of a round [1]")
+    parser.add_argument("--output", type=Path, help="file for the figures; PyBullet greets on standard output")
     options = parser.parse_args()
     context = multiprocessing.get_context("spawn")
     rows: dict[str, list[float]] = {"bullet": [], "planar": []}
@@ -97,7 +99,10 @@ def main() -> None:
             "most": round(max(ratios), 2),
         },
     }
-    print(json.dumps(report, indent=2))
+    text = json.dumps(report, indent=2)
+    print(text)
+    if options.output is not None:
+        options.output.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
