@@ -28,7 +28,7 @@ def energy_distance(prediction: torch.Tensor, target: torch.Tensor) -> torch.Ten
         Paper Eq. (6); Székely and Rizzo (2013), "Energy statistics".
 
     Examples:
-        2 * (|0 - 1| + |2 - 1|) / 2 - (0 + 2 + 2 + 0) / 4 - 0 = 2 - 1 = 1:
+        ``2 * (|0 - 1| + |2 - 1|) / 2 - (0 + 2 + 2 + 0) / 4 - 0 = 2 - 1 = 1``:
 
         >>> energy_distance(torch.tensor([0.0, 2.0]), torch.tensor([1.0])).item()
         1.0

@@ -54,24 +54,24 @@ def sample_scenarios(
 ) -> TensorDict:
     """Return what the given episodes look like.
 
-    ======================  ==============  ============================================================================
-    Leaf                    Shape           Meaning (float64 and world frame unless said otherwise)
-    ======================  ==============  ============================================================================
-    ``object_edge``         ``[B]``         object's edge [m]
-    ``object_mass``         ``[B]``         object's mass [kg]
-    ``floor_friction``      ``[B]``         Coulomb friction between object and floor [1]
-    ``com_offset``          ``[B, 3]``      object's centre of mass in its own frame [m]
-    ``object_pose``         ``[B, 3]``      object's start (x [m], y [m], yaw [rad])
-    ``goal_pose``           ``[B, 3]``      goal (x [m], y [m], yaw [rad])
-    ``robot_pose``          ``[B, 3]``      base's start (x [m], y [m], yaw [rad])
-    ``num_obstacles``       ``[B]``         how many obstacles appear, int64
-    ``obstacle_edge``       ``[B, 6]``      obstacles' edges [m]
-    ``obstacle_time``       ``[B, 6]``      when they appear [s]
-    ``obstacle_yaw``        ``[B, 6]``      obstacles' yaws [rad]
-    ``obstacle_place``      ``[B, 6, F, 2]``  ordered places to try, uniform in [0, 1) [1]; see :func:`spawn_obstacles`
-    ``adversarial``         ``[B]``         whether obstacles appear on the object-to-goal line, bool
-    ``surface_point``       ``[B, 3]``      p_r, uniform on the object's vertical faces, in the object's frame [m]
-    ======================  ==============  ============================================================================
+    ======================  ================  ==========================================================================
+    Leaf                    Shape             Meaning (float64 and world frame unless said otherwise)
+    ======================  ================  ==========================================================================
+    ``object_edge``         ``[B]``           object's edge [m]
+    ``object_mass``         ``[B]``           object's mass [kg]
+    ``floor_friction``      ``[B]``           Coulomb friction between object and floor [1]
+    ``com_offset``          ``[B, 3]``        object's centre of mass in its own frame [m]
+    ``object_pose``         ``[B, 3]``        object's start (x [m], y [m], yaw [rad])
+    ``goal_pose``           ``[B, 3]``        goal (x [m], y [m], yaw [rad])
+    ``robot_pose``          ``[B, 3]``        base's start (x [m], y [m], yaw [rad])
+    ``num_obstacles``       ``[B]``           how many obstacles appear, int64
+    ``obstacle_edge``       ``[B, 6]``        obstacles' edges [m]
+    ``obstacle_time``       ``[B, 6]``        when they appear [s]
+    ``obstacle_yaw``        ``[B, 6]``        obstacles' yaws [rad]
+    ``obstacle_place``      ``[B, 6, F, 2]``  ordered places to try, uniform in [0, 1), see :func:`spawn_obstacles`
+    ``adversarial``         ``[B]``           whether obstacles appear on the object-to-goal line, bool
+    ``surface_point``       ``[B, 3]``        p_r, uniform on the object's vertical faces, in the object's frame [m]
+    ======================  ================  ==========================================================================
 
     Args:
         config: Layout and ranges.
