@@ -7,9 +7,8 @@ OMP_NUM_THREADS=2 python benchmarks/iteration_profile.py --simulator planar --nu
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
-import shlex
-import sys
 import time
 from collections import defaultdict
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from cura_torchrl.trainers.build import Networks, build_collector
-from cura_torchrl.trainers.info import git_commit, hardware, versions
+from cura_torchrl.trainers.info import provenance
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.methods import method
 
@@ -67,7 +66,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, help="file for the figures; PyBullet greets on standard output")
     options = parser.parse_args()
     base = method("cura-ppo")
-    ppo = base.ppo.__class__(rollout_steps=options.steps, minibatch_size=options.minibatch_size)
+    ppo = dataclasses.replace(base.ppo, rollout_steps=options.steps, minibatch_size=options.minibatch_size)
     frames = options.num_envs * options.steps
     config = base.replace(
         simulator=options.simulator, num_envs=options.num_envs, num_workers=1, ppo=ppo, total_frames=2 * frames
@@ -94,10 +93,7 @@ def main() -> None:
     watch.seconds["learner"] = finished - collected
     total = finished - start
     report = {
-        "command": shlex.join(["python", "benchmarks/iteration_profile.py", *sys.argv[1:]]),
-        "commit": git_commit(),
-        "hardware": hardware(),
-        "versions": versions(),
+        **provenance(),
         "threads": torch.get_num_threads(),
         "frames": batch.numel(),
         "frames_per_second": round(batch.numel() / total),

@@ -14,8 +14,6 @@ import json
 import os
 import platform
 import statistics
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +26,7 @@ from cura_torchrl import ConfidenceMap, CURALoss, DistributionalCollisionEstimat
 from cura_torchrl.modules import make_actor, make_critic
 from cura_torchrl.objectives.functional import energy_distance
 from cura_torchrl.trainers.build import load_encoder
+from cura_torchrl.trainers.info import provenance
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -203,19 +202,13 @@ def measure_loss(data: TensorDict, rounds: int, batch: int = 4096) -> dict[str, 
     return {"batch": batch, **figures}
 
 
-def provenance() -> dict[str, Any]:
-    """Return command, commit and hardware."""
-    root = Path(__file__).resolve().parents[1]
-    git = ["git", "-C", str(root), "rev-parse", "--short", "HEAD"]
+def settings() -> dict[str, Any]:
+    """Return the processor's name and how PyTorch was set up."""
     names = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
     return {
-        "command": " ".join(["python", "benchmarks/map_throughput.py", *sys.argv[1:]]),
-        "commit": subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip(),
         "processor": names[0].split(":")[1].strip() if names else platform.processor(),
-        "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "huge_pages": os.environ.get("THP_MEM_ALLOC_ENABLE") == "1",
-        "torch": torch.__version__,
     }
 
 
@@ -236,7 +229,7 @@ def main() -> None:
         "loss": lambda: measure_loss(data, 5 * arguments.rounds),
     }
     chosen = [arguments.only] if arguments.only else list(parts)
-    print(json.dumps(provenance() | {name: parts[name]() for name in chosen}, indent=2))
+    print(json.dumps(provenance() | settings() | {name: parts[name]() for name in chosen}, indent=2))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +19,7 @@ from tqdm import tqdm
 from cura_torchrl.envs.config import LidarConfig, PushEnvConfig, ScenarioConfig, TaskConfig
 from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.envs.robots.scripted import ScriptedPusher
-from cura_torchrl.trainers.info import git_commit, versions
+from cura_torchrl.trainers.info import provenance
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -234,9 +233,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     report = {
-        "command": shlex.join(["python", "benchmarks/parity.py", *sys.argv[1:]]),
-        "commit": git_commit(),
-        "versions": versions(),
+        **provenance(),
         "scans": compare_scans(options.scans, options.rows),
         "free_motion": compare_free_motion(options.scenes, options.rows),
         "scripted_pushes": compare_pushing(options.scenes, options.rows, "scripted"),

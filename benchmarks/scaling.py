@@ -11,7 +11,6 @@ import dataclasses
 import json
 import logging
 import os
-import sys
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -22,7 +21,7 @@ from ray import cloudpickle
 from tensordict import TensorDict, TensorDictBase
 
 from cura_torchrl.trainers.build import Networks, build_collector
-from cura_torchrl.trainers.info import git_commit, hardware, versions
+from cura_torchrl.trainers.info import provenance
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.methods import method
 from cura_torchrl.trainers.ray_backend import without_scan
@@ -310,11 +309,10 @@ def main() -> None:
         learner_fps=learner["learner_fps"],
         **cost_of_calls(calls, rollout.numel()),
     )
+    made_with = provenance()
+    made_with["versions"]["ray"] = ray.__version__
     result = {
-        "command": " ".join(["python", "benchmarks/scaling.py", *sys.argv[1:]]),
-        "commit": git_commit(),
-        "versions": {**versions(), "ray": ray.__version__},
-        "hardware": hardware(),
+        **made_with,
         "load_average": load,
         "assumptions": {
             "cores_per_node": CORES_PER_NODE,

@@ -9,9 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import shlex
 import statistics
-import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -20,7 +18,7 @@ import torch
 
 from cura_torchrl.envs.config import PushEnvConfig, Simulator
 from cura_torchrl.envs.push import PushEnv
-from cura_torchrl.trainers.info import git_commit, hardware, versions
+from cura_torchrl.trainers.info import provenance
 
 _ENVS: dict[str, PushEnv] = {}
 
@@ -87,10 +85,7 @@ def main() -> None:
                 rows["planar"].append(planar)
     ratios = [planar / bullet for planar, bullet in zip(rows["planar"], rows["bullet"], strict=True)]
     report = {
-        "command": shlex.join(["python", "benchmarks/simulators.py", *sys.argv[1:]]),
-        "commit": git_commit(),
-        "hardware": hardware(),
-        "versions": versions(),
+        **provenance(),
         "threads": torch.get_num_threads(),
         "env_steps_per_second": {name: round(statistics.median(values)) for name, values in rows.items()},
         "ratio": {

@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib.util
 import os
 import platform
+import shlex
 import shutil
 import subprocess
+import sys
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -78,6 +80,24 @@ def hardware() -> dict[str, Any]:
     """
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     return {"platform": platform.platform(), "cores": len(os.sched_getaffinity(0)), "memory_gib": round(memory, 1)}
+
+
+def provenance() -> dict[str, Any]:
+    """Return what a results file records: the command as it was typed, commit, hardware and versions.
+
+    Returns:
+        JSON-compatible, by those names.
+
+    Examples:
+        >>> sorted(provenance())
+        ['command', 'commit', 'hardware', 'versions']
+    """
+    return {
+        "command": shlex.join(["python", *sys.argv]),
+        "commit": git_commit(),
+        "hardware": hardware(),
+        "versions": versions(),
+    }
 
 
 def capabilities() -> dict[str, bool]:

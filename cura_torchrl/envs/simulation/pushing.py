@@ -195,8 +195,7 @@ class _Touch:
     """Contact of the pushers with the cube in one tick. Impulses at a point ``[3, B, N]``: normal, left, up."""
 
     def __init__(self, cube: Cube, footprint: _Footprint, pushers: Pushers, physics: PhysicsConfig) -> None:
-        rectangle = footprint.rectangle
-        self._contact = contact = rectangle_manifold(pushers.rectangle, _expanded(rectangle, pushers.height))
+        contact = rectangle_manifold(pushers.rectangle, _expanded(footprint.rectangle, pushers.height))
         self._x, self._y = contact.normal_x, contact.normal_y
         own_x, own_y = contact.x - cube.pose[:, 0], contact.y - cube.pose[:, 1]
         far_x, far_y = contact.x - pushers.anchor[0], contact.y - pushers.anchor[1]
