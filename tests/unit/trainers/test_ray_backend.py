@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import signal
 import threading
 import time
@@ -18,10 +17,10 @@ from cura_torchrl.trainers.build import Networks, build_collector
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint, read_config
 from cura_torchrl.trainers.errors import NodeLostError, NonFiniteError, UnavailableError, WorkerError
 from cura_torchrl.trainers.learner import Learner
-from cura_torchrl.trainers.methods import method
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.ray_backend import DROPPED_KEYS, Node, place, require_ray, without_scan
 from cura_torchrl.trainers.train import train
+from tests.runs import FRAMES, small_run
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,27 +28,11 @@ if TYPE_CHECKING:
 
     from cura_torchrl.trainers.config import TrainConfig
 
-FRAMES = 8
-"""Frames of one rollout: two worlds, four steps."""
-
 
 @pytest.fixture
 def config(tmp_path: Path) -> TrainConfig:
     """A run of three updates that sees no map, with a worker on each of two nodes."""
-    preset = method("cura-ppo")
-    sizes = {"actor_hidden_sizes": (8,), "critic_hidden_sizes": (8,), "collision_hidden_sizes": (8,)}
-    return preset.replace(
-        backend="ray",
-        num_envs=2,
-        num_workers=2,
-        total_frames=3 * FRAMES,
-        perception="none",
-        run_dir=tmp_path / "run",
-        checkpoint_minutes=1e6,
-        learner_threads=1,
-        ppo=dataclasses.replace(preset.ppo, rollout_steps=4),
-        network=dataclasses.replace(preset.network, **sizes),
-    )
+    return small_run(tmp_path / "run", updates=3, backend="ray", num_workers=2, checkpoint_minutes=1e6)
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import signal
 from typing import TYPE_CHECKING
@@ -16,34 +15,20 @@ from cura_torchrl.trainers.build import Networks, build_collector
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint, read_config
 from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NonFiniteError, WorkerError
 from cura_torchrl.trainers.learner import Learner
-from cura_torchrl.trainers.methods import method
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.train import most_obstacles, train
+from tests.runs import FRAMES, small_run
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from cura_torchrl.trainers.config import TrainConfig
 
-FRAMES = 8
-"""Frames of one rollout: two worlds, four steps."""
-
 
 @pytest.fixture
 def config(tmp_path: Path) -> TrainConfig:
     """A run of two updates that sees no map."""
-    preset = method("cura-ppo")
-    sizes = {"actor_hidden_sizes": (8,), "critic_hidden_sizes": (8,), "collision_hidden_sizes": (8,)}
-    return preset.replace(
-        num_envs=2,
-        total_frames=2 * FRAMES,
-        perception="none",
-        run_dir=tmp_path / "run",
-        checkpoint_minutes=0.0,
-        learner_threads=1,
-        ppo=dataclasses.replace(preset.ppo, rollout_steps=4),
-        network=dataclasses.replace(preset.network, **sizes),
-    )
+    return small_run(tmp_path / "run", updates=2, checkpoint_minutes=0.0)
 
 
 def frames_of(config: TrainConfig) -> list[float]:
