@@ -1,30 +1,17 @@
-"""Which cells of a grid a planar scan has seen: pure batched geometry.
-
-On a CPU, comparisons, masked writes and integer indices on large tensors cost 5 to 15 times as much as float
-arithmetic. So the large masks here are float tensors, made by ``sign``, and the large lookups are nearest-neighbour
-samples of a table at a float coordinate: that kernel reads no integers, uses all vector lanes and all threads.
-"""
+"""Which cells of a grid a planar scan has seen: pure batched geometry."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from torch.nn import functional as F  # noqa: N812
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 _FAR = 1e6
 """Coordinate of the cells that stand for the outside [m]: beyond the reach of any ray."""
 
-_NEAR = 1e-30
-"""Stands for a distance of 0 where it is divided by [m]: its inverse times any distance is finite."""
-
 _VECTOR_LANES = 16
-"""Row lengths are multiples of this: no cell falls to a loop's scalar tail in one batch and not in another."""
+"""Row lengths are multiples of this: the loops over a row have no tails."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,117 +127,14 @@ def clean_scan(scan: torch.Tensor, max_range: float) -> torch.Tensor:
     return scan.nan_to_num(nan=0.0, posinf=max_range).clamp(0.0, max_range)
 
 
-class ScanView(NamedTuple):
-    """A scan as the cells of a grid ask for it; everything is per sensor, so that a part of it is a view too.
-
-    The bearings of a row of cells span half a turn, from -90 to 90 degrees around one of two directions, by which side
-    of the sensor the row lies on. The table holds the rays of both half turns, one after the other.
-    """
-
-    table: torch.Tensor
-    """Square of the distance at which a ray stops to see cells free [m^2], shape ``[N, K]``."""
-    row_start: torch.Tensor
-    """Coordinate in the table of a bearing of 0 in the row's half turn [1], shape ``[N, X, 1]``."""
-    row_inverse: torch.Tensor
-    """One over the row's distance ahead of the sensor [1/m], shape ``[N, X, 1]``."""
-    row_square: torch.Tensor
-    """Square of the row's distance [m^2], shape ``[N, X, 1]``."""
-    column_offset: torch.Tensor
-    """Column's distance to the left of the sensor [m], shape ``[N, 1, Y]``."""
-    column_square: torch.Tensor
-    """Its square [m^2], shape ``[N, 1, Y]``."""
-    per_radian: float
-    """Coordinate in the table per bearing [1/rad]."""
-
-    def split(self, size: int) -> Iterator[ScanView]:
-        """Go through the view in parts.
-
-        Args:
-            size: Sensors of a part [1].
-
-        Yields:
-            Views of that many sensors, the last one of those that are left; they alias this one.
-        """
-        for tensors in zip(*(tensor.split(size) for tensor in self[:-1]), strict=True):
-            yield ScanView._make((*tensors, self.per_radian))
-
-
-def view_scan(
-    row_x: torch.Tensor, column_y: torch.Tensor, scan: torch.Tensor, sensor_pose: torch.Tensor, half_diagonal: float
-) -> ScanView:
-    """Prepare a scan for :func:`free_margin`.
-
-    Args:
-        row_x: World x of the cell centres of each row [m], shape ``[X]``.
-        column_y: World y of the cell centres of each column [m], shape ``[Y]``.
-        scan: Ranges as from :func:`clean_scan` [m], rays as in :func:`~cura_torchrl.envs.sensors.ray_angles`, shape
-            ``[N, R]``.
-        sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
-        half_diagonal: Half of a cell's diagonal [m].
-
-    Returns:
-        The scan by cells.
-
-    Examples:
-        >>> view_scan(torch.ones(4), torch.ones(5), torch.ones(2, 8), torch.zeros(2, 3), 0.07).row_start.shape
-        torch.Size([2, 4, 1])
-    """
-    num_rays = scan.shape[-1]
-    rays_per_radian = num_rays / (2 * math.pi)
-    # Nearest ray to world bearing b: floor((b - yaw + pi) R / 2 pi + 1/2) mod R. The table of a half turn starts at the
-    # ray nearest to its first bearing, less one for rounding, and ends one after that nearest to its last.
-    half = num_rays // 2 + 4
-    turned = (math.pi - sensor_pose[:, 2:].double()) * rays_per_radian + 0.5 - num_rays / 4
-    turned = torch.remainder(torch.cat([turned, turned + num_rays / 2], -1), num_rays)
-    first = turned.floor()
-    ray = (first.long()[..., None] + torch.arange(-1, half - 1, device=scan.device)).remainder(num_rays)
-    reach = (scan - half_diagonal).clamp_(min=0.0).square_()
-    # The table's coordinate runs from -1 to 1, as the sampling has it.
-    start = turned.sub_(first).add_(num_rays / 4 + 1.0).div_(half)
-    start[:, 0] -= 1.0
-    dx = row_x - sensor_pose[:, :1]
-    # On the row of the sensor itself the bearing is 90 or -90 degrees, and 0 at the sensor.
-    dx = torch.where(dx == 0.0, _NEAR, dx)[..., None]
-    dy = (column_y - sensor_pose[:, 1:2])[:, None]
-    row_start = torch.where(dx < 0.0, start[:, 1, None, None], start[:, 0, None, None]).float()
-    table = reach.gather(1, ray.flatten(1))
-    return ScanView(table, row_start, dx.reciprocal(), dx.square(), dy, dy.square(), rays_per_radian / half)
-
-
-def free_margin(view: ScanView, scratch: torch.Tensor | None = None) -> torch.Tensor:
-    """Return by how much cells are nearer than what has been measured at their bearing, in squares.
-
-    A cell is seen free if its centre is nearer to the sensor than the range of the ray nearest to its bearing, less
-    half a cell's diagonal. This leaves no gaps between few rays and needs one lookup a cell. Bearings are exact to
-    1e-4 of the angle between rays: nearer than that to the middle between two rays, either may be asked.
-
-    Args:
-        view: The scan, from :func:`view_scan`.
-        scratch: Memory to overwrite, shape ``[N, X, Y]``; None allocates it.
-
-    Returns:
-        Difference of the squares of range and distance [m^2], positive where seen free, shape ``[N, X, Y]``. Does not
-        alias the scratch.
-
-    Examples:
-        >>> view = view_scan(torch.tensor([1.0, 3.0]), torch.zeros(1), torch.full((1, 8), 2.0), torch.zeros(1, 3), 0.0)
-        >>> free_margin(view).flatten().tolist()
-        [3.0, -5.0]
-    """
-    coordinate = torch.mul(view.row_inverse, view.column_offset, out=scratch).atan_()
-    coordinate = torch.add(view.row_start, coordinate, alpha=view.per_radian, out=scratch)
-    return sample_table(view.table, coordinate).sub_(view.row_square).sub_(view.column_square)
-
-
 def seen_free(
-    row_x: torch.Tensor,
-    column_y: torch.Tensor,
-    scan: torch.Tensor,
-    sensor_pose: torch.Tensor,
-    half_diagonal: float,
-    scratch: torch.Tensor | None = None,
+    row_x: torch.Tensor, column_y: torch.Tensor, scan: torch.Tensor, sensor_pose: torch.Tensor, margin: float
 ) -> torch.Tensor:
-    """Tell which cells a scan has seen to be free, as :func:`free_margin` defines it.
+    """Tell which cells a scan has seen to be free.
+
+    A cell is seen free if its centre is nearer to the sensor than the range of the ray nearest to its bearing, less a
+    margin. This leaves no gaps between few rays and needs one lookup a cell. Bearings are exact to 1e-4 of the angle
+    between rays: nearer than that to the middle between two rays, either may be asked.
 
     Args:
         row_x: World x of the cell centres of each row [m], shape ``[X]``.
@@ -258,40 +142,25 @@ def seen_free(
         scan: Ranges as from :func:`clean_scan` [m], rays as in :func:`~cura_torchrl.envs.sensors.ray_angles`, shape
             ``[N, R]``.
         sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
-        half_diagonal: Half of a cell's diagonal [m].
-        scratch: Memory to overwrite, shape ``[N, X, Y]``; None allocates it.
+        margin: What is taken off each range [m].
 
     Returns:
-        1 where the cell is seen free, else 0, float32, shape ``[N, X, Y]``.
+        Whether the cell is seen free, bool, shape ``[N, X, Y]``.
 
     Examples:
         >>> centres = torch.tensor([1.0, 2.0, 3.0])
         >>> scan = torch.full((1, 8), 2.5)
-        >>> seen_free(centres, torch.zeros(1), scan, torch.zeros(1, 3), half_diagonal=0.07).flatten().tolist()
-        [1.0, 1.0, 0.0]
+        >>> seen_free(centres, torch.zeros(1), scan, torch.zeros(1, 3), margin=0.07).flatten().tolist()
+        [True, True, False]
     """
-    view = view_scan(row_x, column_y, scan, sensor_pose, half_diagonal)
-    return free_margin(view, scratch).sign_().relu_()
-
-
-def sample_table(table: torch.Tensor, coordinate: torch.Tensor) -> torch.Tensor:
-    """Look up the nearest entry of a table per row of the batch.
-
-    Args:
-        table: Entries, shape ``[N, K]``.
-        coordinate: Where to look [1]: entry k lies at ``(2 k + 1) / K - 1``, shape ``[N, H, W]``.
-
-    Returns:
-        Entries, 0 where the coordinate is outside of -1 to 1, shape ``[N, H, W]``.
-
-    Examples:
-        >>> sample_table(torch.tensor([[5.0, 6.0]]), torch.tensor([[[-0.9, -0.1, 0.1, 1.1]]])).tolist()
-        [[[5.0, 5.0, 6.0, 0.0]]]
-    """
-    # The table is an image of height 1, of which any second coordinate within -1 to 1 finds the only row: the first one
-    # serves, and saves a tensor.
-    points = coordinate[..., None].expand(*coordinate.shape, 2)
-    return F.grid_sample(table[:, None, None], points, mode="nearest", align_corners=False)[:, 0]
+    num_rays = scan.shape[-1]
+    per_radian = num_rays / (2.0 * math.pi)
+    dx, dy = (row_x - sensor_pose[:, :1])[..., None], (column_y - sensor_pose[:, 1:2])[:, None]
+    start = (math.pi - sensor_pose[:, 2].double()) * per_radian + 0.5
+    start = start.remainder(num_rays).float()[:, None, None]
+    ray = torch.atan2(dy, dx).mul_(per_radian).add_(start).floor_().long().remainder_(num_rays)
+    reach = (scan - margin).clamp_min(0.0).square()
+    return dx.square() + dy.square() < reach.gather(1, ray.flatten(1)).view(ray.shape)
 
 
 def scan_points(

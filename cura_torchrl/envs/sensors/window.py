@@ -36,17 +36,16 @@ class WindowFrame(NamedTuple):
     columns: torch.Tensor
     """Terms of the columns, shape ``[2, N, 1, W]``."""
 
-    def points(self, rows: slice, scratch: torch.Tensor | None = None) -> torch.Tensor:
+    def points(self, rows: slice = slice(None)) -> torch.Tensor:
         """Return the coordinates of the cells of some of the windows.
 
         Args:
             rows: Which of the windows.
-            scratch: Memory to overwrite, shape ``[2, N, W, W]``; None allocates it.
 
         Returns:
-            The two coordinates of each cell, shape ``[N, W, W, 2]``; aliases the scratch.
+            The two coordinates of each cell, shape ``[N, W, W, 2]``.
         """
-        return torch.add(self.rows[:, rows], self.columns[:, rows], out=scratch).permute(1, 2, 3, 0)
+        return (self.rows[:, rows] + self.columns[:, rows]).permute(1, 2, 3, 0)
 
 
 def map_frame(grid: MapGrid, offsets: torch.Tensor, sensor_pose: torch.Tensor) -> WindowFrame:
@@ -67,7 +66,7 @@ def map_frame(grid: MapGrid, offsets: torch.Tensor, sensor_pose: torch.Tensor) -
         >>> from cura_torchrl.envs.sensors import MapGrid
         >>> grid = MapGrid(extent_x=(0.0, 0.4), extent_y=(0.0, 0.8), resolution=0.1)
         >>> frame = map_frame(grid, window_offsets(2, 0.2), torch.tensor([[0.2, 0.2, 0.0]]))
-        >>> [[round(value, 3) for value in point] for point in frame.points(slice(None))[0, :, 0].tolist()]
+        >>> [[round(value, 3) for value in point] for point in frame.points()[0, :, 0].tolist()]
         [[-0.75, -0.5], [-0.75, 0.5]]
     """
     x, y, yaw = sensor_pose.double().unbind(-1)
@@ -94,7 +93,7 @@ def footprint_frame(
 
     Examples:
         >>> frame = footprint_frame(torch.tensor([0.0, 1.0]), torch.zeros(1, 3), torch.zeros(1, 3), torch.ones(2))
-        >>> frame.points(slice(None))[0, 1].tolist()
+        >>> frame.points()[0, 1].tolist()
         [[2.0, 0.0], [2.0, 2.0]]
     """
     shift_x, shift_y, turn = (sensor_pose.double() - pose.double()).unbind(-1)

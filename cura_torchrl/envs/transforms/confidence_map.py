@@ -17,20 +17,17 @@ from torchrl.envs.transforms.utils import _get_reset
 
 from cura_torchrl import keys
 from cura_torchrl.envs.config import MapConfig, require
-from cura_torchrl.envs.sensors import visibility, window
+from cura_torchrl.envs.sensors import map_kernels, map_tensors, visibility, window
 from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.envs.sensors.visibility import MapGrid
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from tensordict import NestedKey
 
-_CHUNK_CELLS = 5 * 2**15
-"""Cells processed at once on a CPU: keeps the work space in the cache."""
-
-_CHUNK_CELLS_ELSEWHERE = 2**25
-"""Cells processed at once on another device, where the number of kernels counts: bounds the work space."""
+_NOWHERE = 1e5
+"""How far away the object is where there is none [m]."""
 
 _MAX_AGE = 2**16
 """Age [steps] at which a cell's confidence is 0, whatever the decay."""
@@ -124,10 +121,10 @@ class ConfidenceMap(Transform):
             "_column_y": self.grid.column_y(),
             "_offsets": offsets,
             "_directions": torch.stack(visibility.unit_vector(ray_angles(num_rays))),
-            "_powers": powers[None],
+            "_powers": powers,
             "_robot_size": torch.tensor(robot_size),
             # Times two, for what tells an obstacle from free space is half a step.
-            "_robot_mask": 2.0 - 2.0 * window.inside_footprint(robot.points(slice(None))),
+            "_robot_mask": 2.0 - 2.0 * window.inside_footprint(robot.points())[0],
         }
         for name, table in tables.items():
             self.register_buffer(name, table, persistent=False)
@@ -136,7 +133,6 @@ class ConfidenceMap(Transform):
         self._start = float(len(powers))
         self.register_buffer("_stamps", torch.zeros(0, self.grid.num_rows, self.grid.num_columns), persistent=False)
         self.register_buffer("_steps", torch.zeros(0), persistent=False)
-        self._map_space = self._window_space = torch.empty(0)
         self._batch_shape = torch.Size([])
 
     @property
@@ -213,35 +209,20 @@ class ConfidenceMap(Transform):
     def _observe(self, stamps: torch.Tensor, steps: torch.Tensor, inputs: list[torch.Tensor]) -> torch.Tensor:
         """Return the windows after one scan is integrated into ``stamps`` and ``steps``, in place."""
         steps += 1
-        scan, pose = visibility.clean_scan(inputs[0], self.max_range), inputs[1]
+        scan, pose = visibility.clean_scan(inputs[0], self.max_range), inputs[1].contiguous()
         torch._assert_async(pose.isfinite().all(), "a sensor's pose is out of bounds: accepted are finite numbers")
-        if self._map_space.numel() == 0 or self._map_space.device != scan.device:
-            self._allocate(scan.device)
-        view = visibility.view_scan(self._row_x, self._column_y, scan, pose, self.grid.half_diagonal)
-        hits = self._find_hits(scan, steps[:, None], inputs)
-        chunks = _chunks(len(scan), self._map_space)
-        for (rows, (scratch,)), part in zip(chunks, view.split(self._map_space.shape[1]), strict=True):
-            seen = visibility.free_margin(part, scratch).sign_().mul_(steps[rows, None, None])
-            maps = torch.maximum(stamps[rows], seen, out=stamps[rows]).flatten(1)
-            for cells, stamp in hits:
-                maps.scatter_(1, cells[rows], stamp[rows])
-        windows = scan.new_empty(len(scan), self.num_channels, self.config.window, self.config.window)
-        frames = [window.map_frame(self.grid, self._offsets, pose)]
-        if len(inputs) > 2:
-            frames.append(window.footprint_frame(self._offsets, pose, inputs[2], inputs[3]))
-        for rows, scratch in _chunks(len(scan), self._window_space):
-            points = (frame.points(rows, scratch) for frame in frames)
-            self._fill(windows[rows], stamps[rows], steps[rows], points, scratch)
-        return windows
-
-    def _allocate(self, device: torch.device) -> None:
-        num_cells = _CHUNK_CELLS if device.type == "cpu" else _CHUNK_CELLS_ELSEWHERE
-        for name, shape, num_floats in (
-            ("_map_space", (self.grid.num_rows, self.grid.num_columns), 1),
-            ("_window_space", (self.config.window, self.config.window), 2),
-        ):
-            count = max(1, num_cells // (shape[0] * shape[1]))
-            setattr(self, name, torch.empty(num_floats, count, *shape, device=device))
+        cells = map_kernels if scan.device.type == "cpu" else map_tensors
+        cells.mark_free((self._row_x, self._column_y), stamps, steps, scan, pose, self.grid.half_diagonal)
+        for hit, stamp in self._find_hits(scan, steps[:, None], inputs):
+            stamps.flatten(1).scatter_(1, hit, stamp)
+        frames = (
+            window.map_frame(self.grid, self._offsets, pose),
+            window.footprint_frame(self._offsets, pose, inputs[2], inputs[3]),
+        )
+        channels = 1 if self.config.channels == "confidence" else 2
+        windows = scan.new_empty(len(scan), channels, self.config.window, self.config.window)
+        cells.fill_windows(self.grid, windows, stamps, steps, frames, (self._robot_mask, self._powers))
+        return windows.prod(1, keepdim=True) if self.config.channels == "product" else windows
 
     def _find_hits(
         self, scan: torch.Tensor, steps: torch.Tensor, inputs: list[torch.Tensor]
@@ -252,39 +233,13 @@ class ConfidenceMap(Transform):
         # Half a cell below the maximum is five times the LiDAR's noise: a noisy miss is no obstacle.
         is_hit = is_inside & (scan > 0.0) & (scan < self.max_range - 0.5 * self.config.resolution)
         is_obstacle = is_hit & ~visibility.inside_rectangle(x, y, inputs[1], self._robot_size)
-        if len(inputs) > 2:
-            is_obstacle &= ~visibility.inside_rectangle(x, y, inputs[2], inputs[3], margin=self.config.resolution)
+        is_obstacle &= ~visibility.inside_rectangle(x, y, inputs[2], inputs[3], margin=self.config.resolution)
         # What is not to be written goes to cell 0, outside of the extent, as the 0 that is there already. Obstacles
         # come second: a cell that holds the object and an obstacle is occupied, whatever the order of the rays.
         return [(cells * is_hit, steps * is_hit), (cells * is_obstacle, (steps + 0.5) * is_obstacle)]
 
-    def _fill(
-        self,
-        windows: torch.Tensor,
-        stamps: torch.Tensor,
-        steps: torch.Tensor,
-        points: Iterator[torch.Tensor],
-        scratch: torch.Tensor,
-    ) -> None:
-        stamp = window.sample_map(self.grid, stamps, next(points))
-        last_seen, age = torch.floor(stamp, out=scratch[0]), scratch[1]
-        # The age as the coordinate of its power in the table.
-        scale = 2.0 / self._powers.shape[-1]
-        torch.add(((steps + 0.5) * scale - 1.0)[:, None, None], last_seen, alpha=-scale, out=age)
-        windows[:, 0] = visibility.sample_table(self._powers.expand(len(age), -1), age)
-        if self.config.channels == "confidence":
-            return
-        occupancy = stamp.sub_(last_seen).mul_(self._robot_mask)
-        # What is left is the object's footprint, if there is one; its points overwrite the scratch.
-        for footprint in points:
-            occupancy.sub_(window.inside_footprint(footprint)).relu_()
-        if self.config.channels == "product":
-            windows[:, 0] *= occupancy
-        else:
-            windows[:, 1] = occupancy
-
     def _read(self, tensordict: TensorDictBase) -> list[torch.Tensor]:
-        # The inputs with one batch dimension; the batch's shape is noted.
+        # The inputs with one batch dimension, an object among them; the batch's shape is noted.
         values = [tensordict.get(key) for key in self.in_keys]
         if any(value is None for value in values):
             given = sorted(map(str, tensordict.keys(True, True)))
@@ -294,7 +249,8 @@ class ConfidenceMap(Transform):
             values[0].shape[-1] == self.num_rays, "number of rays", values[0].shape[-1], f"num_rays = {self.num_rays}"
         )
         self._batch_shape = values[0].shape[:-1]
-        return [value.reshape(-1, value.shape[-1]).float() for value in values]
+        inputs = [value.reshape(-1, value.shape[-1]).float() for value in values]
+        return inputs if len(inputs) > 2 else [*inputs, inputs[1] + _NOWHERE, inputs[1].new_ones(len(inputs[1]), 2)]
 
     def _write(self, tensordict: TensorDictBase, window: torch.Tensor) -> TensorDictBase:
         tensordict.set(self.out_keys[0], window.view(*self._batch_shape, *window.shape[1:]))
@@ -306,17 +262,10 @@ class ConfidenceMap(Transform):
         return reset_keys[0]
 
 
-def _chunks(num_rows: int, space: torch.Tensor) -> Iterator[tuple[slice, torch.Tensor]]:
-    # Slices of the batch that fit the work space, each with its part of it.
-    size = space.shape[1]
-    for start in range(0, num_rows, size):
-        count = min(size, num_rows - start)
-        yield slice(start, start + count), space[:, :count]
-
-
 def _decay_powers(decay: float) -> torch.Tensor:
-    """Return ``decay ** k`` for ``k = 0, 1, ...`` until it is 0 in float32 or the greatest age is reached."""
+    """Return ``decay ** k`` for ``k = 0, 1, ...`` until it is 0 in float32 or the greatest age is reached, then a 0."""
     if decay <= 0.0:
         return torch.tensor([1.0, 0.0])
     steps = _MAX_AGE if decay >= 1.0 else min(_MAX_AGE, math.ceil(math.log(1e-46) / math.log(decay)))
-    return torch.pow(torch.tensor(decay, dtype=torch.float64), torch.arange(steps + 1)).float()
+    powers = torch.pow(torch.tensor(decay, dtype=torch.float64), torch.arange(steps + 1)).float()
+    return torch.cat([powers, torch.zeros(1)])

@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from cura_torchrl.envs.config import MapConfig
+from cura_torchrl.envs.sensors import map_tensors
 from cura_torchrl.envs.transforms import ConfidenceMap, confidence_map
 from tests.contracts.transform import STEPS, TransformContract
 from tests.scenes import MAX_RANGE, NUM_RAYS, ReferenceMap, ScanEnv, cast_rays
@@ -265,10 +266,19 @@ class TestState:
         env = TransformedEnv(ScanEnv((0, 1), dtype=torch.float64), make_map())
         assert env.rollout(3)["confidence_map"].dtype == torch.float32
 
+    def test_tensors_do_what_the_kernels_do(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Catches two definitions of the map: one on the CPU, one elsewhere."""
+        kernels = make_env(tuple(range(7))).rollout(STEPS, break_when_any_done=False)["confidence_map"]
+        monkeypatch.setattr(confidence_map, "map_kernels", map_tensors)
+        tensors = make_env(tuple(range(7))).rollout(STEPS, break_when_any_done=False)["confidence_map"]
+        # Cells whose centre lies on a border between two rays, or two cells, to 1e-4.
+        assert (tensors != kernels).float().mean() < 1e-4
+
     def test_chunks_change_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Catches a chunk whose rows are mixed up, or a work space that leaks."""
+        """Catches a chunk whose rows are mixed up."""
+        monkeypatch.setattr(confidence_map, "map_kernels", map_tensors)
         expected = make_env(tuple(range(7))).rollout(STEPS, break_when_any_done=False)
-        monkeypatch.setattr(confidence_map, "_CHUNK_CELLS", 20_000)  # two maps of 102 x 80 cells
+        monkeypatch.setattr(map_tensors, "_CHUNK_CELLS", 20_000)  # two maps of 102 x 80 cells
         actual = make_env(tuple(range(7))).rollout(STEPS, break_when_any_done=False)
         assert torch.equal(actual["confidence_map"], expected["confidence_map"])
 

@@ -1,0 +1,202 @@
+"""The confidence map's loops over cells, compiled for the CPU: what tensor operations do in several passes over memory.
+
+One world after the other stays in the cache, and a row of cells is handled in short loops of which each but the lookup
+runs on all vector lanes. The threads are torch's. On other devices :mod:`.map_tensors` does the same.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+import torch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from cura_torchrl.envs.sensors.visibility import MapGrid
+    from cura_torchrl.envs.sensors.window import WindowFrame
+
+# Without what lets results depend on which cells share a vector: no reordered sums, no approximate functions.
+_COMPILED: dict[str, Any] = {
+    "nogil": True,
+    "cache": True,
+    "error_model": "numpy",
+    "fastmath": {"nnan", "ninf", "nsz", "contract"},
+}
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_HALF_TURN, _QUARTER_TURN = np.float32(math.pi), np.float32(0.5 * math.pi)
+_NEAR = np.float32(1e-30)
+"""Keeps the bearing of a cell in whose centre the sensor stands a number."""
+
+
+@numba.njit(**_COMPILED)
+def _find_rays(ray, column_y, dx, sensor_y, per_radian, start):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    # arctan on 0 to 1 to 2e-8: Abramowitz and Stegun, Handbook of Mathematical Functions, 4.4.49.
+    ahead = abs(dx)
+    for j in range(column_y.shape[0]):
+        dy = column_y[j] - sensor_y
+        left = abs(dy)
+        ratio = min(ahead, left) / max(ahead, left, _NEAR)
+        square = ratio * ratio
+        value = np.float32(0.0028662257) * square - np.float32(0.0161657367)
+        value = value * square + np.float32(0.0429096138)
+        value = value * square - np.float32(0.0752896400)
+        value = value * square + np.float32(0.1065626393)
+        value = value * square - np.float32(0.1420889944)
+        value = value * square + np.float32(0.1999355085)
+        value = value * square - np.float32(0.3333314528)
+        bearing = value * square * ratio + ratio
+        bearing = _QUARTER_TURN - bearing if left > ahead else bearing
+        bearing = _HALF_TURN - bearing if dx < _ZERO else bearing
+        ray[j] = np.int32(math.copysign(bearing, dy) * per_radian + start)
+
+
+@numba.njit(**_COMPILED)
+def _look_up(values, index, table):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    for j in range(index.shape[0]):
+        values[j] = table[np.uint32(index[j])]
+
+
+@numba.njit(**_COMPILED)
+def _mark(stamps, reach, column_y, dx, sensor_y, stamp):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    for j in range(column_y.shape[0]):
+        dy = column_y[j] - sensor_y
+        seen = stamp if dx * dx + dy * dy < reach[j] else _ZERO
+        stamps[j] = max(stamps[j], seen)
+
+
+@numba.njit(**_COMPILED)
+def _mark_free(stamps, steps, table, start, pose, row_x, column_y, per_radian):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    ray, reach = np.empty(column_y.shape[0], np.int32), np.empty(column_y.shape[0], np.float32)
+    for n in range(stamps.shape[0]):
+        farthest, sensor_y = table[n].max(), pose[n, 1]
+        for i in range(row_x.shape[0]):
+            dx = row_x[i] - pose[n, 0]
+            if dx * dx < farthest:
+                _find_rays(ray, column_y, dx, sensor_y, per_radian, start[n])
+                _look_up(reach, ray, table[n])
+                _mark(stamps[n, i], reach, column_y, dx, sensor_y, steps[n])
+
+
+@numba.njit(**_COMPILED)
+def _find_cells(cell, at_x, at_y, along_x, along_y, num_x, num_y, stride):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    for j in range(cell.shape[0]):
+        x = (at_x + along_x[j] + _ONE) * (np.float32(0.5) * num_x)
+        y = (at_y + along_y[j] + _ONE) * (np.float32(0.5) * num_y)
+        is_inside = (x >= _ZERO) & (x < num_x) & (y >= _ZERO) & (y < num_y)
+        # Cell 0 lies outside of the extent: it is never seen.
+        cell[j] = (np.int32(x) + np.int32(1)) * stride + np.int32(y) if is_inside else np.int32(0)
+
+
+@numba.njit(**_COMPILED)
+def _find_ages(age, stamps, step, oldest):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    for j in range(age.shape[0]):
+        age[j] = np.int32(min(step - np.floor(stamps[j]), oldest))
+
+
+@numba.njit(**_COMPILED)
+def _occupy(occupancy, stamps, mask, at_x, at_y, along_x, along_y):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    for j in range(stamps.shape[0]):
+        farthest = max(abs(at_x + along_x[j]), abs(at_y + along_y[j]))
+        value = (stamps[j] - np.floor(stamps[j])) * mask[j]
+        occupancy[j] = _ZERO if farthest <= _ONE else value
+
+
+@numba.njit(**_COMPILED)
+def _fill(windows, maps, steps, rows, columns, mask, powers, size):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    num_cells = windows.shape[-1]
+    cell, age, stamps = np.empty(num_cells, np.int32), np.empty(num_cells, np.int32), np.empty(num_cells, np.float32)
+    num_x, num_y, oldest = np.float32(size[0]), np.float32(size[1]), np.float32(powers.shape[0] - 1)
+    stride = np.int32(size[2])
+    for n in range(windows.shape[0]):
+        at, along = rows[n], columns[n]
+        for i in range(num_cells):
+            _find_cells(cell, at[1, i], at[0, i], along[1], along[0], num_x, num_y, stride)
+            _look_up(stamps, cell, maps[n])
+            _find_ages(age, stamps, steps[n], oldest)
+            _look_up(windows[n, 0, i], age, powers)
+            if windows.shape[1] > 1:
+                _occupy(windows[n, 1, i], stamps, mask[i], at[2, i], at[3, i], along[2], along[3])
+
+
+def mark_free(
+    axes: tuple[torch.Tensor, torch.Tensor],
+    stamps: torch.Tensor,
+    steps: torch.Tensor,
+    scan: torch.Tensor,
+    sensor_pose: torch.Tensor,
+    margin: float,
+) -> None:
+    """Do what :func:`.map_tensors.mark_free` does, on the CPU.
+
+    Args:
+        axes: World x of the rows' and world y of the columns' cell centres [m], shapes ``[X]`` and ``[Y]``.
+        stamps: Stored maps, changed in place, shape ``[N, X, Y]``.
+        steps: Time, no less than any stamp [1], shape ``[N]``.
+        scan: Ranges as from :func:`~.visibility.clean_scan` [m], shape ``[N, R]``.
+        sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
+        margin: What is taken off each range [m].
+
+    Examples:
+        >>> stamps, centres = torch.zeros(1, 1, 3), torch.tensor([1.0, 2.0, 3.0])
+        >>> axes = (torch.zeros(1), centres)
+        >>> mark_free(axes, stamps, torch.ones(1), torch.full((1, 8), 2.5), torch.zeros(1, 3), 0.07)
+        >>> stamps.flatten().tolist()
+        [1.0, 1.0, 0.0]
+    """
+    num_rays = scan.shape[-1]
+    # The table holds two turns, so that no bearing wraps: its entry k is ray k - shift, modulo a turn.
+    shift, per_radian = num_rays // 2 + 1, num_rays / (2.0 * math.pi)
+    rays = torch.arange(-shift, 2 * num_rays + 2 - shift).remainder(num_rays)
+    table = (scan - margin).clamp_min(0.0).square()[:, rays]
+    start = (math.pi - sensor_pose[:, 2].double()) * per_radian + 0.5
+    start = (start.remainder(num_rays) + shift).float()
+    constants = (*(axis.numpy() for axis in axes), np.float32(per_radian))
+    _run(_mark_free, (stamps, steps, table, start, sensor_pose), constants)
+
+
+def fill_windows(
+    grid: MapGrid,
+    windows: torch.Tensor,
+    stamps: torch.Tensor,
+    steps: torch.Tensor,
+    frames: tuple[WindowFrame, WindowFrame],
+    tables: tuple[torch.Tensor, torch.Tensor],
+) -> None:
+    """Do what :func:`.map_tensors.fill_windows` does, on the CPU.
+
+    Args:
+        grid: The maps' cells.
+        windows: Windows to write, shape ``[N, C, W, W]``.
+        stamps: Stored maps: the time a cell was last seen, plus a half if it was occupied, shape
+            ``[N, num_rows, num_columns]``.
+        steps: Time now [1], shape ``[N]``.
+        frames: Places of the windows' cells on the map and on the object.
+        tables: Occupancy per half of a stamp, 0 where none is shown, shape ``[W, W]``; confidence by age, shape
+            ``[K]``, its last entry for all ages beyond.
+    """
+    rows = torch.cat([frame.rows[..., 0] for frame in frames]).movedim(1, 0).contiguous()
+    columns = torch.cat([frame.columns[..., 0, :] for frame in frames]).movedim(1, 0).contiguous()
+    size = (grid.num_x, grid.num_y, grid.num_columns)
+    batch = (windows, stamps.flatten(1), steps, rows, columns)
+    _run(_fill, batch, (*(table.numpy() for table in tables), size))
+
+
+def _run(kernel: Callable[..., None], batch: tuple[torch.Tensor, ...], constants: tuple[Any, ...]) -> None:
+    """Run a kernel on as many threads as torch has, each with a part of the batch."""
+    arrays = [tensor.numpy() for tensor in batch]
+    count = len(arrays[0])
+    threads = min(torch.get_num_threads(), count)
+    if threads <= 1:
+        kernel(*arrays, *constants)
+        return
+    bounds = np.linspace(0, count, threads + 1).astype(int)
+    with ThreadPoolExecutor(threads) as pool:
+        parts = [[array[low:high] for array in arrays] for low, high in pairwise(bounds)]
+        for _ in pool.map(lambda part: kernel(*part, *constants), parts):
+            pass
