@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-_STRIDES = (4, 2, 2)
-"""Strides of the convolutions: the first one is what makes the encoder fast."""
+_ACTIVATIONS = {"relu": nn.ReLU, "elu": nn.ELU}
 
 
 class MapLoss(NamedTuple):
@@ -83,10 +82,10 @@ def map_vae_loss(
 class MapVAE(nn.Module):
     """Encodes maps into short codes and decodes codes into maps.
 
-    The encoder is a 5 x 5 convolution with stride 4 and two 3 x 3 convolutions with stride 2, each followed by an ELU,
-    then a linear layer to mean and log-variance. The decoder mirrors it, but in the end each pixel paints a tile of
-    4 x 4 cells of its own, which is faster than a transposed convolution. As a module it returns the mean, so that an
-    instance is an encoder for :class:`~cura_torchrl.envs.transforms.EncodeMap`, or for
+    The encoder is a convolution whose stride is what makes it fast, and two 3 x 3 convolutions with stride 2, each
+    followed by an activation, then a linear layer to mean and log-variance. The decoder mirrors it, but in the end each
+    pixel paints a tile of cells of its own, which is faster than a transposed convolution. As a module it returns the
+    mean, so that an instance is an encoder for :class:`~cura_torchrl.envs.transforms.EncodeMap`, or for
     ``TensorDictModule(vae, [keys.CONFIDENCE_MAP], [keys.LATENT])``.
 
     Args:
@@ -94,9 +93,11 @@ class MapVAE(nn.Module):
         channels: Channels C of a map [1].
         window: Cells along a map's edge W [1].
         widths: Channels after each of the three convolutions [1].
+        patch: Kernel and stride of the first convolution [1].
+        activation: ``"relu"`` or ``"elu"``.
 
     Raises:
-        ValueError: If ``widths`` are not three.
+        ValueError: If ``widths`` are not three, or the activation is another.
 
     Source:
         Paper, section "Sensor Encoding"; layers: measured for speed, the paper names none.
@@ -114,35 +115,48 @@ class MapVAE(nn.Module):
         latent_size: int = 32,
         channels: int = 2,
         window: int = 100,
-        widths: Sequence[int] = (16, 32, 64),
+        widths: Sequence[int] = (16, 32, 32),
+        patch: tuple[int, int] = (5, 5),
+        activation: str = "relu",
     ) -> None:
         super().__init__()
-        if len(widths) != len(_STRIDES):
-            msg = f"widths are {tuple(widths)}; accepted: {len(_STRIDES)} numbers of channels"
+        if len(widths) != 3:
+            msg = f"widths are {tuple(widths)}; accepted: 3 numbers of channels"
             raise ValueError(msg)
-        self.shape = {"latent_size": latent_size, "channels": channels, "window": window, "widths": tuple(widths)}
-        kernels = [stride + 1 for stride in _STRIDES]
+        if activation not in _ACTIVATIONS:
+            msg = f"activation is {activation!r}; accepted: {', '.join(_ACTIVATIONS)}"
+            raise ValueError(msg)
+        self.shape = {
+            "latent_size": latent_size,
+            "channels": channels,
+            "window": window,
+            "widths": tuple(widths),
+            "patch": tuple(patch),
+            "activation": activation,
+        }
+        act = _ACTIVATIONS[activation]
+        kernels, strides = (patch[0], 3, 3), (patch[1], 2, 2)
+        # Patches that tile the window need no padding.
+        paddings = (0 if window % patch[0] == 0 and patch[0] == patch[1] else patch[0] // 2, 1, 1)
         sizes = [window]
-        for stride in _STRIDES:
-            sizes.append((sizes[-1] - 1) // stride + 1)
+        for kernel, stride, padding in zip(kernels, strides, paddings, strict=True):
+            sizes.append((sizes[-1] + 2 * padding - kernel) // stride + 1)
         planes = [channels, *widths]
         features = planes[-1] * sizes[-1] ** 2
         layers: list[nn.Module] = []
-        for i, (kernel, stride) in enumerate(zip(kernels, _STRIDES, strict=True)):
-            layers += [nn.Conv2d(planes[i], planes[i + 1], kernel, stride, padding=kernel // 2), nn.ELU()]
+        for i in range(3):
+            layers += [nn.Conv2d(planes[i], planes[i + 1], kernels[i], strides[i], paddings[i]), act()]
         self.trunk = nn.Sequential(*layers, nn.Flatten())
         self.statistics_head = nn.Linear(features, 2 * latent_size)
-        layers = [nn.Linear(latent_size, features), nn.ELU(), nn.Unflatten(1, (planes[-1], sizes[-1], sizes[-1]))]
-        for i in reversed(range(1, len(_STRIDES))):
+        layers = [nn.Linear(latent_size, features), act(), nn.Unflatten(1, (planes[-1], sizes[-1], sizes[-1]))]
+        for i in (2, 1):
             # What a convolution with this stride has rounded away, the transposed one has to add.
-            rest = sizes[i] - ((sizes[i + 1] - 1) * _STRIDES[i] + 1)
+            rest = sizes[i] - ((sizes[i + 1] - 1) * strides[i] + 1)
             layers += [
-                nn.ConvTranspose2d(
-                    planes[i + 1], planes[i], kernels[i], _STRIDES[i], padding=kernels[i] // 2, output_padding=rest
-                ),
-                nn.ELU(),
+                nn.ConvTranspose2d(planes[i + 1], planes[i], kernels[i], strides[i], 1, output_padding=rest),
+                act(),
             ]
-        self.decoder = nn.Sequential(*layers, _Tiles(planes[1], channels, _STRIDES[0], window))
+        self.decoder = nn.Sequential(*layers, _Tiles(planes[1], channels, patch[1], window))
         # Channels last suits the CPU's convolutions; most of all with few channels.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from torch.nn import functional as F  # noqa: N812
 from tqdm import tqdm
 
-from cura_torchrl.envs.config import MapConfig, PushEnvConfig, require, require_finite
+from cura_torchrl.envs.config import MapConfig, PushEnvConfig, Simulator, require, require_finite
 from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.envs.transforms import ConfidenceMap
 from cura_torchrl.modules.map_vae import MapVAE, map_vae_loss
@@ -53,6 +53,8 @@ class PretrainMapConfig:
     """Folder for weights, figures, picture and maps."""
     env: PushEnvConfig = field(default_factory=PushEnvConfig)
     """Environment; its scenarios come from the stream "vae", with occlusion and without it half of the time each."""
+    simulators: tuple[Simulator, ...] = ("bullet", "planar")
+    """Simulators that the maps come from, as many from each; ``env.simulator`` is not used."""
     map: MapConfig = field(default_factory=MapConfig)
     """Map; its decay has to lie between 0 and 1, the other ones follow from it."""
     decays: tuple[float, ...] = (0.9, 1.0)
@@ -108,23 +110,26 @@ class PretrainMapConfig:
             "threads",
         ):
             require(getattr(self, name) >= 1, name, getattr(self, name), "1 or more")
+        require(bool(self.simulators), "simulators", self.simulators, "one or more")
         require(0.0 < self.held_out <= 0.5, "held_out", self.held_out, "above 0, up to 0.5")
         require(self.lr > 0 and self.beta >= 0, "lr, beta", (self.lr, self.beta), "positive, not negative")
 
 
-def make_random_env(config: PretrainMapConfig, worker: int, *, occlusion: bool) -> EnvBase:
+def make_random_env(config: PretrainMapConfig, worker: int, *, occlusion: bool, simulator: Simulator) -> EnvBase:
     """Return a worker's environment for collecting.
 
     Args:
         config: Environment.
         worker: Index of the process.
         occlusion: Whether rays see the object.
+        simulator: Which simulator runs the worlds.
 
     Returns:
         Environment with true obstacles for the scripted pusher, on the stream "vae".
     """
     task = dataclasses.replace(config.env.task, stream="vae", privileged=True, random_first_age=False)
-    env = dataclasses.replace(config.env, task=task, lidar=dataclasses.replace(config.env.lidar, occlusion=occlusion))
+    lidar = dataclasses.replace(config.env.lidar, occlusion=occlusion)
+    env = dataclasses.replace(config.env, task=task, lidar=lidar, simulator=simulator)
     return PushEnv(
         config.num_envs,
         env,
@@ -146,7 +151,7 @@ def pretrain_map(
 
     Args:
         config: Everything.
-        make_env: Called with the configuration, a worker's index and ``occlusion``; reaches other processes.
+        make_env: Called with the configuration, a worker's index, ``occlusion`` and ``simulator``; must be picklable.
         policy: What pushes; None is the scripted pusher with noise.
 
     Returns:
@@ -176,7 +181,7 @@ def pretrain_map(
 
 def _maps(config: PretrainMapConfig, make_env: Callable[..., EnvBase], policy: TensorDictModuleBase) -> MapDataset:
     """Return the maps of this configuration, collected now if need be."""
-    names = ("env", "map", "num_maps", "keep_every", "num_envs", "num_workers", "noise", "seed")
+    names = ("env", "simulators", "map", "num_maps", "keep_every", "num_envs", "num_workers", "noise", "seed")
     fingerprint = json.dumps([encode(getattr(config, name)) for name in names])
     path = config.run_dir / MAPS_NAME
     data = MapDataset.load(path, fingerprint)
@@ -187,15 +192,16 @@ def _maps(config: PretrainMapConfig, make_env: Callable[..., EnvBase], policy: T
     lidar = config.env.lidar
     parts = [
         collect_maps(
-            functools.partial(make_env, config, occlusion=occlusion),
+            functools.partial(make_env, config, occlusion=occlusion, simulator=simulator),
             functools.partial(ConfidenceMap, map_config, num_rays=lidar.num_rays, max_range=lidar.max_range),
             policy,
             num_envs=config.num_envs,
             num_workers=config.num_workers,
-            num_maps=math.ceil(config.num_maps / 2),
+            num_maps=math.ceil(config.num_maps / (2 * len(config.simulators))),
             keep_every=config.keep_every,
             seed=config.seed,
         )
+        for simulator in config.simulators
         for occlusion in (True, False)
     ]
     data = MapDataset(torch.cat([part.codes for part in parts]), torch.cat([part.episodes for part in parts]))

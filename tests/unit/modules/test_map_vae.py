@@ -83,11 +83,25 @@ class TestMapVAE:
         assert ((shown >= 0) & (shown <= 1)).all()
 
     def test_layers_are_those_of_the_design(self) -> None:
-        """Catches a layer that makes the encoder slower: 5x5 stride 4 to 16, 3x3 stride 2 to 32, then 64."""
+        """Catches a layer that makes the encoder slower: 5x5 stride 5 to 16, 3x3 stride 2 to 32, then 32."""
         convolutions = [layer for layer in MapVAE().trunk if isinstance(layer, torch.nn.Conv2d)]
         found = [(c.in_channels, c.out_channels, c.kernel_size[0], c.stride[0]) for c in convolutions]
-        assert found == [(2, 16, 5, 4), (16, 32, 3, 2), (32, 64, 3, 2)]
+        assert found == [(2, 16, 5, 5), (16, 32, 3, 2), (32, 32, 3, 2)]
         assert MapVAE().latent_size == 32
+
+    @pytest.mark.parametrize("window", [20, 33, 100])
+    def test_every_cell_reaches_the_code(self, window: int) -> None:
+        """Catches patches that leave out the window's last cells."""
+        maps = torch.rand(1, 2, window, window, requires_grad=True)
+        MapVAE(window=window, activation="elu").encode(maps).square().sum().backward()
+        assert (maps.grad != 0).all()
+
+    def test_impossible_shapes_are_refused(self) -> None:
+        """Catches an activation or a depth that fails later, without a word."""
+        with pytest.raises(ValueError, match="accepted: relu, elu"):
+            MapVAE(activation="tanh")
+        with pytest.raises(ValueError, match="3 numbers"):
+            MapVAE(widths=(8, 8))
 
     def test_the_code_is_the_mean(self) -> None:
         """Catches a code that is sampled, or the wrong half of the head."""

@@ -46,7 +46,7 @@ class EpisodeEnv(ScanEnv):
         )
 
 
-def toy_env(config: PretrainMapConfig, worker: int, *, occlusion: bool) -> EnvBase:
+def toy_env(config: PretrainMapConfig, worker: int, *, occlusion: bool, simulator: str) -> EnvBase:
     """Return the toy environment of a worker; module-level, so that it reaches other processes."""
     first = worker * config.num_envs
     return EpisodeEnv(tuple(range(first, first + config.num_envs)))
