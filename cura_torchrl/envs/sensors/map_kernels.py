@@ -7,35 +7,28 @@ runs on all vector lanes. The threads are torch's. On other devices :mod:`.map_t
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
 import torch
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from cura_torchrl.envs.compiled import Floats, Ints, compiled, run_rows
+from cura_torchrl.envs.sensors import visibility
 
+if TYPE_CHECKING:
     from cura_torchrl.envs.sensors.visibility import MapGrid
     from cura_torchrl.envs.sensors.window import WindowFrame
 
-# Without what lets results depend on which cells share a vector: no reordered sums, no approximate functions.
-_COMPILED: dict[str, Any] = {
-    "nogil": True,
-    "cache": True,
-    "error_model": "numpy",
-    "fastmath": {"nnan", "ninf", "nsz", "contract"},
-}
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _HALF_TURN, _QUARTER_TURN = np.float32(math.pi), np.float32(0.5 * math.pi)
 _NEAR = np.float32(1e-30)
 """Keeps the bearing of a cell in whose centre the sensor stands a number."""
 
 
-@numba.njit(**_COMPILED)
-def _find_rays(ray, column_y, dx, sensor_y, per_radian, start):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+@compiled
+def _find_rays(
+    ray: Ints, column_y: Floats, dx: np.float32, sensor_y: np.float32, per_radian: np.float32, start: np.float32
+) -> None:
     # arctan on 0 to 1 to 2e-8: Abramowitz and Stegun, Handbook of Mathematical Functions, 4.4.49.
     ahead = abs(dx)
     for j in range(column_y.shape[0]):
@@ -56,22 +49,33 @@ def _find_rays(ray, column_y, dx, sensor_y, per_radian, start):  # type: ignore[
         ray[j] = np.int32(math.copysign(bearing, dy) * per_radian + start)
 
 
-@numba.njit(**_COMPILED)
-def _look_up(values, index, table):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+@compiled
+def _look_up(values: Floats, index: Ints, table: Floats) -> None:
     for j in range(index.shape[0]):
         values[j] = table[np.uint32(index[j])]
 
 
-@numba.njit(**_COMPILED)
-def _mark(stamps, reach, column_y, dx, sensor_y, stamp):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+@compiled
+def _mark(
+    stamps: Floats, reach: Floats, column_y: Floats, dx: np.float32, sensor_y: np.float32, stamp: np.float32
+) -> None:
     for j in range(column_y.shape[0]):
         dy = column_y[j] - sensor_y
         seen = stamp if dx * dx + dy * dy < reach[j] else _ZERO
         stamps[j] = max(stamps[j], seen)
 
 
-@numba.njit(**_COMPILED)
-def _mark_free(stamps, steps, table, start, pose, row_x, column_y, per_radian):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+@compiled
+def _mark_free(
+    stamps: Floats,
+    steps: Floats,
+    table: Floats,
+    start: Floats,
+    pose: Floats,
+    row_x: Floats,
+    column_y: Floats,
+    per_radian: np.float32,
+) -> None:
     ray, reach = np.empty(column_y.shape[0], np.int32), np.empty(column_y.shape[0], np.float32)
     for n in range(stamps.shape[0]):
         farthest, sensor_y = table[n].max(), pose[n, 1]
@@ -83,32 +87,89 @@ def _mark_free(stamps, steps, table, start, pose, row_x, column_y, per_radian): 
                 _mark(stamps[n, i], reach, column_y, dx, sensor_y, steps[n])
 
 
-@numba.njit(**_COMPILED)
-def _find_cells(cell, at_x, at_y, along_x, along_y, num_x, num_y, stride):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+@compiled
+def _mark_hits(
+    stamps: Floats,
+    steps: Floats,
+    scan: Floats,
+    sensor: Floats,
+    box: Floats,
+    directions: Floats,
+    longest: np.float32,
+    cells: tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.int32],
+) -> None:
+    x_min, y_min, resolution, num_x, num_y, stride = cells
+    for n in range(scan.shape[0]):
+        x, y, cos, sin, length, width = sensor[n]
+        box_x, box_y, box_cos, box_sin, box_length, box_width = box[n]
+        for r in range(scan.shape[1]):
+            if not _ZERO < scan[n, r] < longest:
+                continue
+            ahead, left = directions[0, r] * scan[n, r], directions[1, r] * scan[n, r]
+            end_x, end_y = cos * ahead - sin * left + x, sin * ahead + cos * left + y
+            i, j = np.floor((end_x - x_min) / resolution), np.floor((end_y - y_min) / resolution)
+            if not (_ZERO <= i < num_x and _ZERO <= j < num_y):
+                continue
+            along, across = end_x - box_x, end_y - box_y
+            along, across = along * box_cos + across * box_sin, across * box_cos - along * box_sin
+            is_robot = abs(ahead) <= length and abs(left) <= width
+            is_known = is_robot or (abs(along) <= box_length and abs(across) <= box_width)
+            cell, stamp = (np.int32(i) + np.int32(1)) * stride + np.int32(j), steps[n] + (_ZERO if is_known else _HALF)
+            stamps[n, cell] = max(stamps[n, cell], stamp)
+
+
+@compiled
+def _find_cells(
+    cell: Ints,
+    at_x: np.float32,
+    at_y: np.float32,
+    along_x: Floats,
+    along_y: Floats,
+    num_x: np.float32,
+    num_y: np.float32,
+    stride: np.int32,
+) -> None:
     for j in range(cell.shape[0]):
-        x = (at_x + along_x[j] + _ONE) * (np.float32(0.5) * num_x)
-        y = (at_y + along_y[j] + _ONE) * (np.float32(0.5) * num_y)
+        x = (at_x + along_x[j] + _ONE) * (_HALF * num_x)
+        y = (at_y + along_y[j] + _ONE) * (_HALF * num_y)
         is_inside = (x >= _ZERO) & (x < num_x) & (y >= _ZERO) & (y < num_y)
         # Cell 0 lies outside of the extent: it is never seen.
         cell[j] = (np.int32(x) + np.int32(1)) * stride + np.int32(y) if is_inside else np.int32(0)
 
 
-@numba.njit(**_COMPILED)
-def _find_ages(age, stamps, step, oldest):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+@compiled
+def _find_ages(age: Ints, stamps: Floats, step: np.float32, oldest: np.float32) -> None:
     for j in range(age.shape[0]):
         age[j] = np.int32(min(step - np.floor(stamps[j]), oldest))
 
 
-@numba.njit(**_COMPILED)
-def _occupy(occupancy, stamps, mask, at_x, at_y, along_x, along_y):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+@compiled
+def _occupy(
+    occupancy: Floats,
+    stamps: Floats,
+    mask: Floats,
+    at_x: np.float32,
+    at_y: np.float32,
+    along_x: Floats,
+    along_y: Floats,
+) -> None:
     for j in range(stamps.shape[0]):
         farthest = max(abs(at_x + along_x[j]), abs(at_y + along_y[j]))
         value = (stamps[j] - np.floor(stamps[j])) * mask[j]
         occupancy[j] = _ZERO if farthest <= _ONE else value
 
 
-@numba.njit(**_COMPILED)
-def _fill(windows, maps, steps, rows, columns, mask, powers, size):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+@compiled
+def _fill(
+    windows: Floats,
+    maps: Floats,
+    steps: Floats,
+    rows: Floats,
+    columns: Floats,
+    mask: Floats,
+    powers: Floats,
+    size: tuple[int, int, int],
+) -> None:
     num_cells = windows.shape[-1]
     cell, age, stamps = np.empty(num_cells, np.int32), np.empty(num_cells, np.int32), np.empty(num_cells, np.float32)
     num_x, num_y, oldest = np.float32(size[0]), np.float32(size[1]), np.float32(powers.shape[0] - 1)
@@ -156,8 +217,42 @@ def mark_free(
     table = (scan - margin).clamp_min(0.0).square()[:, rays]
     start = (math.pi - sensor_pose[:, 2].double()) * per_radian + 0.5
     start = (start.remainder(num_rays) + shift).float()
-    constants = (*(axis.numpy() for axis in axes), np.float32(per_radian))
-    _run(_mark_free, (stamps, steps, table, start, sensor_pose), constants)
+    batch = (stamps, steps, table, start, sensor_pose)
+    run_rows(_mark_free, batch, *(axis.numpy() for axis in axes), np.float32(per_radian))
+
+
+def mark_hits(
+    grid: MapGrid,
+    stamps: torch.Tensor,
+    steps: torch.Tensor,
+    scan: torch.Tensor,
+    directions: torch.Tensor,
+    rectangles: tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor],
+    longest: float,
+) -> None:
+    """Do what :func:`.map_tensors.mark_hits` does, on the CPU.
+
+    Args:
+        grid: The maps' cells.
+        stamps: Stored maps, changed in place, shape ``[N, num_rows, num_columns]``.
+        steps: Time, no less than any stamp [1], shape ``[N]``.
+        scan: Ranges as from :func:`~.visibility.clean_scan` [m], shape ``[N, R]``.
+        directions: Unit vectors along the rays in the base frame [1], shape ``[2, R]``.
+        rectangles: Sensor's pose ``[N, 3]`` and the robot's (length, width) around it ``[N, 2]``, then the object's
+            pose and size likewise (x [m], y [m], yaw [rad], world frame) [m]: what rays end on inside is no obstacle.
+        longest: Ranges from here on have hit nothing [m].
+    """
+    pose, robot_size, object_pose, object_size = rectangles
+    batch = (stamps.flatten(1), steps, scan, _placed(pose, robot_size), _placed(object_pose, object_size))
+    numbers = (grid.extent_x[0], grid.extent_y[0], grid.resolution, grid.num_x, grid.num_y)
+    cells = (*(np.float32(number) for number in numbers), np.int32(grid.num_columns))
+    run_rows(_mark_hits, batch, directions.numpy(), np.float32(longest), cells)
+
+
+def _placed(pose: torch.Tensor, size: torch.Tensor) -> torch.Tensor:
+    """Return centre, cosine and sine of the yaw, and half of the size, shape ``[N, 6]``."""
+    cos, sin = visibility.unit_vector(pose[:, 2])
+    return torch.cat([pose[:, :2], cos[:, None], sin[:, None], size / 2.0], dim=-1)
 
 
 def fill_windows(
@@ -184,19 +279,4 @@ def fill_windows(
     columns = torch.cat([frame.columns[..., 0, :] for frame in frames]).movedim(1, 0).contiguous()
     size = (grid.num_x, grid.num_y, grid.num_columns)
     batch = (windows, stamps.flatten(1), steps, rows, columns)
-    _run(_fill, batch, (*(table.numpy() for table in tables), size))
-
-
-def _run(kernel: Callable[..., None], batch: tuple[torch.Tensor, ...], constants: tuple[Any, ...]) -> None:
-    """Run a kernel on as many threads as torch has, each with a part of the batch."""
-    arrays = [tensor.numpy() for tensor in batch]
-    count = len(arrays[0])
-    threads = min(torch.get_num_threads(), count)
-    if threads <= 1:
-        kernel(*arrays, *constants)
-        return
-    bounds = np.linspace(0, count, threads + 1).astype(int)
-    with ThreadPoolExecutor(threads) as pool:
-        parts = [[array[low:high] for array in arrays] for low, high in pairwise(bounds)]
-        for _ in pool.map(lambda part: kernel(*part, *constants), parts):
-            pass
+    run_rows(_fill, batch, *(table.numpy() for table in tables), size)

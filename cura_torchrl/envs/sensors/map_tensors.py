@@ -48,6 +48,40 @@ def mark_free(
         stamps[rows] = torch.where(free, steps[rows, None, None], stamps[rows])
 
 
+def mark_hits(
+    grid: MapGrid,
+    stamps: torch.Tensor,
+    steps: torch.Tensor,
+    scan: torch.Tensor,
+    directions: torch.Tensor,
+    rectangles: tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor],
+    longest: float,
+) -> None:
+    """Write the time into the cells in which rays end, and half a step more where that is on an obstacle.
+
+    Args:
+        grid: The maps' cells.
+        stamps: Stored maps, changed in place, shape ``[N, num_rows, num_columns]``.
+        steps: Time, no less than any stamp [1], shape ``[N]``.
+        scan: Ranges as from :func:`~.visibility.clean_scan` [m], shape ``[N, R]``.
+        directions: Unit vectors along the rays in the base frame [1], shape ``[2, R]``.
+        rectangles: Sensor's pose ``[N, 3]`` and the robot's (length, width) around it ``[N, 2]``, then the object's
+            pose and size likewise (x [m], y [m], yaw [rad], world frame) [m]: what rays end on inside is no obstacle.
+        longest: Ranges from here on have hit nothing [m].
+    """
+    pose, robot_size, object_pose, object_size = rectangles
+    x, y = visibility.scan_points(scan, pose, directions)
+    cells, is_inside = visibility.cell_of_points(grid, x, y)
+    is_hit = is_inside & (scan > 0.0) & (scan < longest)
+    is_obstacle = is_hit & ~visibility.inside_rectangle(x, y, pose, robot_size)
+    is_obstacle &= ~visibility.inside_rectangle(x, y, object_pose, object_size)
+    flat, now = stamps.flatten(1), steps[:, None]
+    # What is not to be written goes to cell 0, outside of the extent, as the 0 that is there already. Obstacles come
+    # second: a cell that holds the object and an obstacle is occupied, whatever the order of the rays.
+    flat.scatter_(1, cells * is_hit, now * is_hit)
+    flat.scatter_(1, cells * is_obstacle, (now + 0.5) * is_obstacle)
+
+
 def fill_windows(
     grid: MapGrid,
     windows: torch.Tensor,

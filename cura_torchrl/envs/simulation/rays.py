@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
-_CHUNK = 2**17
-"""Ray-square pairs handled together: keeps the work in the cache."""
+from cura_torchrl.envs.compiled import Floats, compiled, run_rows
+
+_CHUNK = 2**25
+"""Ray-square pairs handled together where the loops are not compiled: bounds the work space."""
 
 _PARALLEL = 1e-9
 """Stands for a direction's component that is zero: the ray then crosses a slab nowhere near its end."""
@@ -39,12 +42,46 @@ def free_share(origin: torch.Tensor, ends: torch.Tensor, pose: torch.Tensor, hal
     # The spans in which the ray is within a slab, as shares of the ray: (-+half - start) / direction.
     parts = torch.stack([cos, sin, start_x, start_y, half]).float()
     direction = (ends - origin[:, None]).float()
+    if direction.device.type == "cpu":
+        share = torch.ones_like(direction[..., 0])
+        run_rows(_cast, (share, parts.movedim(0, 2).contiguous(), direction.movedim(2, 1).contiguous()))
+        return share.to(ends.dtype)
     rows = max(1, _CHUNK // max(1, direction.shape[1] * half.shape[1]))
     shares = [
         _nearest(part, *piece.unbind(-1))
         for part, piece in zip(parts.split(rows, 1), direction.split(rows), strict=True)
     ]
     return torch.cat(shares).to(ends.dtype)
+
+
+@compiled
+def _cast(share: Floats, squares: Floats, direction: Floats) -> None:
+    for n in range(share.shape[0]):
+        for m in range(squares.shape[1]):
+            cos, sin, x, y, half = squares[n, m]
+            if half > np.float32(0.0):
+                _cut(share[n], direction[n, 0], direction[n, 1], cos, sin, x, y, half)
+
+
+@compiled
+def _cut(
+    share: Floats,
+    ray_x: Floats,
+    ray_y: Floats,
+    cos: np.float32,
+    sin: np.float32,
+    x: np.float32,
+    y: np.float32,
+    half: np.float32,
+) -> None:
+    one, tiny = np.float32(1.0), np.float32(_PARALLEL)
+    for r in range(share.shape[0]):
+        ahead, left = cos * ray_x[r] + sin * ray_y[r], cos * ray_y[r] - sin * ray_x[r]
+        ahead, left = one / (tiny if abs(ahead) < tiny else ahead), one / (tiny if abs(left) < tiny else left)
+        near = max(-x * ahead - half * abs(ahead), -y * left - half * abs(left))
+        far = min(-x * ahead + half * abs(ahead), -y * left + half * abs(left))
+        is_hit = (near < far) & (near >= np.float32(0.0))
+        share[r] = min(share[r], near) if is_hit else share[r]
 
 
 def _nearest(parts: torch.Tensor, ray_x: torch.Tensor, ray_y: torch.Tensor) -> torch.Tensor:

@@ -213,8 +213,10 @@ class ConfidenceMap(Transform):
         torch._assert_async(pose.isfinite().all(), "a sensor's pose is out of bounds: accepted are finite numbers")
         cells = map_kernels if scan.device.type == "cpu" else map_tensors
         cells.mark_free((self._row_x, self._column_y), stamps, steps, scan, pose, self.grid.half_diagonal)
-        for hit, stamp in self._find_hits(scan, steps[:, None], inputs):
-            stamps.flatten(1).scatter_(1, hit, stamp)
+        # Half a cell below the maximum is five times the LiDAR's noise: a noisy miss is no obstacle.
+        longest = self.max_range - 0.5 * self.config.resolution
+        rectangles = (pose, self._robot_size.expand(len(pose), 2), inputs[2], inputs[3] + 2.0 * self.config.resolution)
+        cells.mark_hits(self.grid, stamps, steps, scan, self._directions, rectangles, longest)
         frames = (
             window.map_frame(self.grid, self._offsets, pose),
             window.footprint_frame(self._offsets, pose, inputs[2], inputs[3]),
@@ -223,20 +225,6 @@ class ConfidenceMap(Transform):
         windows = scan.new_empty(len(scan), channels, self.config.window, self.config.window)
         cells.fill_windows(self.grid, windows, stamps, steps, frames, (self._robot_mask, self._powers))
         return windows.prod(1, keepdim=True) if self.config.channels == "product" else windows
-
-    def _find_hits(
-        self, scan: torch.Tensor, steps: torch.Tensor, inputs: list[torch.Tensor]
-    ) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Return the cells to mark and their stamps: all hits as free, then the obstacles among them."""
-        x, y = visibility.scan_points(scan, inputs[1], self._directions)
-        cells, is_inside = visibility.cell_of_points(self.grid, x, y)
-        # Half a cell below the maximum is five times the LiDAR's noise: a noisy miss is no obstacle.
-        is_hit = is_inside & (scan > 0.0) & (scan < self.max_range - 0.5 * self.config.resolution)
-        is_obstacle = is_hit & ~visibility.inside_rectangle(x, y, inputs[1], self._robot_size)
-        is_obstacle &= ~visibility.inside_rectangle(x, y, inputs[2], inputs[3], margin=self.config.resolution)
-        # What is not to be written goes to cell 0, outside of the extent, as the 0 that is there already. Obstacles
-        # come second: a cell that holds the object and an obstacle is occupied, whatever the order of the rays.
-        return [(cells * is_hit, steps * is_hit), (cells * is_obstacle, (steps + 0.5) * is_obstacle)]
 
     def _read(self, tensordict: TensorDictBase) -> list[torch.Tensor]:
         # The inputs with one batch dimension, an object among them; the batch's shape is noted.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def small(**kwargs) -> MapVAE:
     """Return an autoencoder of small maps."""
-    return MapVAE(**({"latent_size": 4, "window": 20, "widths": (4, 8, 8)} | kwargs))
+    return MapVAE(**({"latent_size": 4, "window": 20, "widths": (4, 8, 8), "patch": (4, 4)} | kwargs))
 
 
 class TestLoss:
@@ -145,18 +145,13 @@ class TestMapVAE:
         assert torch.equal(loaded(maps), vae(maps))
         assert [path.name for path in tmp_path.iterdir()] == ["vae.pt"]
 
-    def test_wrong_widths_are_refused(self) -> None:
-        """Catches a layer that is silently left out."""
-        with pytest.raises(ValueError, match="accepted: 3 numbers"):
-            small(widths=(4, 8))
-
     def test_learns_where_a_block_is(self) -> None:
         """Catches a loss that does not train: one block at 16 places has to come back where it was."""
         maps = torch.zeros(16, 2, 20, 20)
         for place in range(16):
             row, column = 1 + 5 * (place // 4), 1 + 5 * (place % 4)
             maps[place, 1, row : row + 3, column : column + 3] = 1.0
-        vae = small(latent_size=8, widths=(8, 16, 16))
+        vae = small(latent_size=8, widths=(8, 16, 16), patch=(2, 2))
         optimiser = torch.optim.Adam(vae.parameters(), lr=5e-3)
         for _ in range(300):
             mean, log_variance = vae.statistics(maps)

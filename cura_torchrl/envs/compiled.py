@@ -1,0 +1,56 @@
+"""Loops compiled for the CPU by numba: how, and on how many threads."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+
+import numba
+import numpy as np
+import numpy.typing as npt
+import torch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Floats: TypeAlias = npt.NDArray[np.float32]
+Ints: TypeAlias = npt.NDArray[np.int32]
+
+_Function = TypeVar("_Function", bound="Callable[..., Any]")
+
+
+def compiled(function: _Function) -> _Function:
+    """Compile a function on its first call, and keep the result for the next process.
+
+    Sums keep their order and functions their precision: what a row of a batch comes to must not depend on its
+    neighbours in a vector.
+
+    Args:
+        function: Function of arrays and numbers.
+
+    Returns:
+        The compiled function, which runs without Python's lock.
+    """
+    precise = {"nnan", "ninf", "nsz", "contract"}
+    return numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=precise)(function)  # type: ignore[return-value]
+
+
+def run_rows(kernel: Callable[..., None], batch: tuple[torch.Tensor, ...], *constants: Any) -> None:
+    """Run a kernel on as many threads as torch has, each with some rows of the batch.
+
+    Args:
+        kernel: Compiled function of the batch's arrays, then the constants; it writes into some of the arrays.
+        batch: Tensors on the CPU with the same first dimension.
+        *constants: What all rows share.
+    """
+    arrays = [tensor.numpy() for tensor in batch]
+    threads = min(torch.get_num_threads(), len(arrays[0]))
+    if threads <= 1:
+        kernel(*arrays, *constants)
+        return
+    bounds = np.linspace(0, len(arrays[0]), threads + 1).astype(int)
+    parts = [[array[low:high] for array in arrays] for low, high in pairwise(bounds)]
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in pool.map(lambda part: kernel(*part, *constants), parts):
+            pass
