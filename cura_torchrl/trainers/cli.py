@@ -81,6 +81,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit code: 0, 2 after a one-line error, 130 and 143 after SIGINT and SIGTERM.
     """
+    # PyTorch then takes huge pages for large tensors. It reads this once, when it makes the first one.
+    os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
     given = list(sys.argv[1:] if arguments is None else arguments)
     if not given or given[0] in {"-h", "--help"}:
         sys.stdout.write(_overview())

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from cura_torchrl.envs.compiled import Floats, Ints, compiled, run_rows
+from cura_torchrl.compiled import Floats, Ints, compiled, run_rows
 from cura_torchrl.envs.sensors import visibility
 
 if TYPE_CHECKING:

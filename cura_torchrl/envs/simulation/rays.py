@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from cura_torchrl.envs.compiled import Floats, compiled, run_rows
+from cura_torchrl.compiled import Floats, compiled, run_rows
 
 _CHUNK = 2**25
 """Ray-square pairs handled together where the loops are not compiled: bounds the work space."""
