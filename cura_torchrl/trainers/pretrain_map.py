@@ -9,7 +9,7 @@ import logging
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import matplotlib as mpl
 import torch
@@ -71,6 +71,12 @@ class PretrainMapConfig:
     """Standard deviation of the smooth noise on the scripted action, as a share of its range [1]."""
     latent_size: int = 32
     """Length of the code z [1]."""
+    widths: tuple[int, int, int] = (16, 32, 32)
+    """Channels after each of the encoder's convolutions [1]."""
+    patch: tuple[int, int] = (5, 5)
+    """Kernel and stride of its first convolution [cells]."""
+    activation: Literal["relu", "elu"] = "relu"
+    """What follows each convolution."""
     beta: float = 1.0
     """Weight of the KL divergence [1]; 1 is the evidence lower bound but for the weight of occupied cells."""
     occupancy_weight: float = 20.0
@@ -211,7 +217,14 @@ def _maps(config: PretrainMapConfig, make_env: Callable[..., EnvBase], policy: T
 
 def _train(config: PretrainMapConfig, data: MapDataset, train: torch.Tensor, table: torch.Tensor) -> MapVAE:
     torch.manual_seed(config.seed)
-    vae = MapVAE(latent_size=config.latent_size, channels=table.shape[-1], window=config.map.window)
+    vae = MapVAE(
+        latent_size=config.latent_size,
+        channels=table.shape[-1],
+        window=config.map.window,
+        widths=config.widths,
+        patch=config.patch,
+        activation=config.activation,
+    )
     optimiser = torch.optim.Adam(vae.parameters(), lr=config.lr)
     steps = config.epochs * math.ceil(len(train) / config.batch_size)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
