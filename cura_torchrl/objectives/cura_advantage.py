@@ -12,6 +12,7 @@ from torchrl.objectives.value import GAE
 
 from cura_torchrl import keys
 from cura_torchrl.objectives.functional import (
+    accumulate,
     energy_distance,
     masked_moments,
     normalise,
@@ -77,6 +78,8 @@ class CURAAdvantage(TensorDictModuleBase):
         risk_floor: Smallest deviation that the risk cost is divided by [1].
         uncertainty_floor: Smallest deviation that the uncertainty cost is divided by [1].
         cost_clip: Bound on the magnitude of a normalised cost [1].
+        cost_lmbda: Lambda of an advantage estimate of the costs with discount gamma_c [1]; 0 takes each step's own
+            cost, as the paper does.
         advantage_scale: Scale of the advantage beside the costs. The letter of paper Eq. (9) is raw.
         normalise_sum: Whether to scale the penalised advantage to mean 0 and deviation 1 for the optimiser.
         seed: Seed of the target's random choices; the generator's state is part of the state dict.
@@ -133,12 +136,14 @@ class CURAAdvantage(TensorDictModuleBase):
         risk_floor: float = 0.005,
         uncertainty_floor: float = 0.005,
         cost_clip: float = 5.0,
+        cost_lmbda: float = 0.0,
         advantage_scale: AdvantageScale = "raw",
         normalise_sum: bool = True,
         seed: int = 0,
     ) -> None:
         super().__init__()
         _require_unit(gamma=gamma, lmbda=lmbda, collision_gamma=collision_gamma, collision_lmbda=collision_lmbda)
+        _require_unit(cost_lmbda=cost_lmbda)
         _require_positive(risk_floor=risk_floor, uncertainty_floor=uncertainty_floor, cost_clip=cost_clip)
         if advantage_scale not in {"raw", "zscore"}:
             msg = f"advantage_scale is {advantage_scale!r}; accepted: 'raw', 'zscore'"
@@ -150,6 +155,7 @@ class CURAAdvantage(TensorDictModuleBase):
         self.risk_floor = risk_floor
         self.uncertainty_floor = uncertainty_floor
         self.cost_clip = cost_clip
+        self.cost_lmbda = cost_lmbda
         self.advantage_scale = advantage_scale
         self.normalise_sum = normalise_sum
         self.tensor_keys = self._AcceptedKeys()
@@ -307,6 +313,9 @@ class CURAAdvantage(TensorDictModuleBase):
         mask = self._mask(tensordict)
         risk_mask = torch.ones_like(terminated) if mask is None else mask
         uncertainty_mask = risk_mask & ~terminated
+        factor, cut = self.collision_gamma * self.cost_lmbda, self._cut(tensordict)
+        raw_risk = accumulate(raw_risk.masked_fill(~risk_mask, 0.0), cut, factor)
+        raw_uncertainty = accumulate(raw_uncertainty.masked_fill(~uncertainty_mask, 0.0), cut, factor)
         return _Costs(
             raw_risk,
             raw_uncertainty,

@@ -230,6 +230,37 @@ def uncertainty_cost(uncertainty: torch.Tensor, next_uncertainty: torch.Tensor) 
     return next_uncertainty - uncertainty
 
 
+def accumulate(values: torch.Tensor, done: torch.Tensor, factor: float) -> torch.Tensor:
+    """Return the discounted sum of what follows along each trajectory.
+
+    With the risk cost, which is the temporal difference error of the risk, and ``factor = gamma_c * lambda`` this is
+    the generalised advantage estimate of the collision.
+
+    Args:
+        values: Values, time as the last dimension but one, shape ``[*B, T, F]``.
+        done: Whether a trajectory ends with the step, bool, same shape.
+        factor: Weight of the next step beside this one [1].
+
+    Returns:
+        Sums, shape ``[*B, T, F]``.
+
+    Source:
+        Schulman et al. (2016), "High-dimensional continuous control using generalized advantage estimation", Eq. (16).
+
+    Examples:
+        >>> done = torch.tensor([[False], [True], [False]])
+        >>> accumulate(torch.ones(3, 1), done, 0.5).flatten().tolist()
+        [1.5, 1.0, 1.0]
+    """
+    if factor == 0.0:
+        return values
+    sums = values.clone()
+    for step in range(values.shape[-2] - 2, -1, -1):
+        following = sums[..., step + 1, :].masked_fill(done[..., step, :], 0.0)
+        sums[..., step, :] += factor * following
+    return sums
+
+
 def normalise(values: torch.Tensor, *, floor: float, clip: float, mask: torch.Tensor | None = None) -> torch.Tensor:
     """Return (x - mean) / max(std, floor), clipped; steps outside the mask count for nothing and become zero.
 

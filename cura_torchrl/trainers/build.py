@@ -102,6 +102,7 @@ def build_advantage(config: TrainConfig, networks: Networks) -> CURAAdvantage:
         risk_floor=cura.risk_floor,
         uncertainty_floor=cura.uncertainty_floor,
         cost_clip=cura.cost_clip,
+        cost_lmbda=cura.cost_lmbda,
         advantage_scale=cura.advantage_scale,
         normalise_sum=cura.normalise_sum,
         seed=config.seed,

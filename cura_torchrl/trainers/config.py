@@ -100,6 +100,9 @@ class CURAConfig:
     """Smallest standard deviation that the uncertainty cost is divided by [1]."""
     cost_clip: float = 5.0
     """Bound on the magnitude of a normalised cost [1]."""
+    cost_lmbda: float = 0.0
+    """Lambda of an advantage estimate of the costs, which pays back later what was a cost at first [1]; 0 takes each
+    step's own cost, as the paper does. Range: 0 to 1."""
     advantage_scale: Literal["raw", "zscore"] = "raw"
     """Scale of the advantage beside the costs: as it is (the paper), or brought to mean 0 and deviation 1 first."""
     normalise_sum: bool = True
@@ -113,7 +116,7 @@ class CURAConfig:
 
     def __post_init__(self) -> None:
         require_finite(self)
-        for name in ("gamma", "lmbda"):
+        for name in ("gamma", "lmbda", "cost_lmbda"):
             require(0.0 <= getattr(self, name) <= 1.0, name, getattr(self, name), "0 to 1")
         for name in ("num_atoms", "risk_floor", "uncertainty_floor", "cost_clip", "lr", "max_grad_norm"):
             require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")

@@ -95,6 +95,29 @@ def test_the_penalised_advantage_is_the_one_worked_out_by_hand() -> None:
     assert torch.allclose(advantage, expected, atol=1e-5)
 
 
+def test_costs_can_be_accumulated_along_the_trajectory() -> None:
+    """Catches a sum that runs over a trajectory's end, or is normalised step by step before it is taken.
+
+    With factor 0.9 * 0.5: C^R = 0.16 + 0.45 * (0.05 + 0.45 * 0.5), 0.05 + 0.45 * 0.5, 0.5 = 0.28375, 0.275, 0.5;
+    C^U = 0.12 - 0.45 * 0.07, -0.07 = 0.0885, -0.07, of which the mean is 0.00925 and the deviation 0.07925.
+    """
+    options = {"gamma": 0.0, "lmbda": 0.0, "normalise_sum": False}
+    estimate = CURAAdvantage(_zero_critic(), _table(), cost_lmbda=0.5, **options)
+    risk_cost = torch.tensor([0.28375, 0.275, 0.5], dtype=torch.float64)
+    risk_cost = (risk_cost - risk_cost.mean()) / risk_cost.std(correction=0)
+    expected = torch.tensor([1.0, 2.0, 6.0], dtype=torch.float64) - 0.25 * risk_cost
+    expected -= torch.tensor([1.0, -1.0, 0.0], dtype=torch.float64)
+    assert torch.allclose(estimate(_table_rollout())["advantage"].flatten().double(), expected, atol=1e-5)
+    # Cut after the first step: each step is then on its own but for the last two.
+    rollout = _table_rollout()
+    rollout["next", "done"] = torch.tensor([[[True], [False], [True]]])
+    risk_cost = torch.tensor([0.16, 0.275, 0.5], dtype=torch.float64)
+    risk_cost = (risk_cost - risk_cost.mean()) / risk_cost.std(correction=0)
+    only_risk = CURAAdvantage(_zero_critic(), _table(), cost_lmbda=0.5, uncertainty_coeff=0.0, **options)
+    expected = torch.tensor([1.0, 2.0, 6.0], dtype=torch.float64) - 0.25 * risk_cost
+    assert torch.allclose(only_risk(rollout)["advantage"].flatten().double(), expected, atol=1e-5)
+
+
 def test_the_sum_is_standardised_for_the_optimiser() -> None:
     """Catches a sum that keeps the scale of the reward, on which PPO's step size would depend."""
     critic, estimator = _networks()
