@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import torch
 from tensordict import NestedKey
@@ -14,6 +14,7 @@ from cura_torchrl import keys
 from cura_torchrl.objectives.functional import (
     accumulate,
     energy_distance,
+    explain,
     masked_moments,
     normalise,
     risk_cost,
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
 
 AdvantageScale = Literal["raw", "zscore"]
 """Scale of the advantage beside the costs: as GAE returns it, or to mean 0 and deviation 1 first."""
+
+CostBaseline = Literal["mean", "state"]
+"""What a cost is compared with: its mean over the rollout, or what a linear regression on the observation predicts."""
 
 _GAE_KEYS = ("advantage", "value_target", "value", "reward", "done", "terminated")
 
@@ -80,12 +84,13 @@ class CURAAdvantage(TensorDictModuleBase):
         cost_clip: Bound on the magnitude of a normalised cost [1].
         cost_lmbda: Lambda of an advantage estimate of the costs with discount gamma_c [1]; 0 takes each step's own
             cost, as the paper does.
+        cost_baseline: What is subtracted from the costs; the paper has the mean.
         advantage_scale: Scale of the advantage beside the costs. The letter of paper Eq. (9) is raw.
         normalise_sum: Whether to scale the penalised advantage to mean 0 and deviation 1 for the optimiser.
         seed: Seed of the target's random choices; the generator's state is part of the state dict.
 
     Raises:
-        ValueError: If a number or ``advantage_scale`` is not acceptable.
+        ValueError: If a number, ``advantage_scale`` or ``cost_baseline`` is not acceptable.
 
     Source:
         Paper Eq. (7) to (9), Algorithm 1.
@@ -137,6 +142,7 @@ class CURAAdvantage(TensorDictModuleBase):
         uncertainty_floor: float = 0.005,
         cost_clip: float = 5.0,
         cost_lmbda: float = 0.0,
+        cost_baseline: CostBaseline = "mean",
         advantage_scale: AdvantageScale = "raw",
         normalise_sum: bool = True,
         seed: int = 0,
@@ -145,9 +151,8 @@ class CURAAdvantage(TensorDictModuleBase):
         _require_unit(gamma=gamma, lmbda=lmbda, collision_gamma=collision_gamma, collision_lmbda=collision_lmbda)
         _require_unit(cost_lmbda=cost_lmbda)
         _require_positive(risk_floor=risk_floor, uncertainty_floor=uncertainty_floor, cost_clip=cost_clip)
-        if advantage_scale not in {"raw", "zscore"}:
-            msg = f"advantage_scale is {advantage_scale!r}; accepted: 'raw', 'zscore'"
-            raise ValueError(msg)
+        _require_choice("advantage_scale", advantage_scale, get_args(AdvantageScale))
+        _require_choice("cost_baseline", cost_baseline, get_args(CostBaseline))
         self.value_estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=critic_network)
         self.collision_network = collision_network
         self.collision_gamma = collision_gamma
@@ -156,6 +161,7 @@ class CURAAdvantage(TensorDictModuleBase):
         self.uncertainty_floor = uncertainty_floor
         self.cost_clip = cost_clip
         self.cost_lmbda = cost_lmbda
+        self.cost_baseline = cost_baseline
         self.advantage_scale = advantage_scale
         self.normalise_sum = normalise_sum
         self.tensor_keys = self._AcceptedKeys()
@@ -316,6 +322,11 @@ class CURAAdvantage(TensorDictModuleBase):
         factor, cut = self.collision_gamma * self.cost_lmbda, self._cut(tensordict)
         raw_risk = accumulate(raw_risk.masked_fill(~risk_mask, 0.0), cut, factor)
         raw_uncertainty = accumulate(raw_uncertainty.masked_fill(~uncertainty_mask, 0.0), cut, factor)
+        if self.cost_baseline == "state":
+            seen = [*map(tensordict.get, self.collision_network.in_keys), risk, tensordict.get(names.uncertainty)]
+            features = torch.cat(seen, -1)
+            raw_risk = raw_risk - explain(raw_risk, features, risk_mask)
+            raw_uncertainty = raw_uncertainty - explain(raw_uncertainty, features, uncertainty_mask)
         return _Costs(
             raw_risk,
             raw_uncertainty,
@@ -344,6 +355,12 @@ _TINY = 1e-12
 
 def _next(key: NestedKey) -> tuple[str, ...]:
     return ("next", key) if isinstance(key, str) else ("next", *key)
+
+
+def _require_choice(name: str, value: str, accepted: tuple[str, ...]) -> None:
+    if value not in accepted:
+        msg = f"{name} is {value!r}; accepted: {', '.join(map(repr, accepted))}"
+        raise ValueError(msg)
 
 
 def _require_unit(**values: float) -> None:

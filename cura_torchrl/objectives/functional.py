@@ -13,6 +13,13 @@ if TYPE_CHECKING:
     from cura_torchrl.compiled import Floats
 
 
+_RIDGE = 1e-6
+"""Ridge of a regression beside features of deviation 1 [1]."""
+
+_MIN_SPREAD = 1e-9
+"""Stands for the deviation of a feature that never changes."""
+
+
 def energy_distance(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Return the energy distance between two sets of atoms, exactly and without a tensor of all pairs.
 
@@ -259,6 +266,38 @@ def accumulate(values: torch.Tensor, done: torch.Tensor, factor: float) -> torch
         following = sums[..., step + 1, :].masked_fill(done[..., step, :], 0.0)
         sums[..., step, :] += factor * following
     return sums
+
+
+def explain(values: torch.Tensor, features: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+    """Return what a linear regression on features makes of values: a baseline that knows the state and no action.
+
+    Args:
+        values: What to explain, shape ``[*B, 1]``.
+        features: Numbers that describe the state, shape ``[*B, F]``.
+        mask: Which samples count, bool, shape ``[*B, 1]``; all if None.
+
+    Returns:
+        The regression's prediction, 0 where masked, shape ``[*B, 1]``.
+
+    Source:
+        Greensmith, Bartlett and Baxter (2004), "Variance reduction techniques for gradient estimates": baselines.
+
+    Examples:
+        >>> state = torch.tensor([[0.0], [1.0], [2.0]])
+        >>> explain(3.0 * state + 1.0, state).flatten().round(decimals=3).tolist()
+        [1.0, 4.0, 7.0]
+    """
+    inside = torch.ones_like(values, dtype=torch.bool) if mask is None else mask
+    weight = inside.reshape(-1, 1).double()
+    rows, target = features.reshape(-1, features.shape[-1]).double() * weight, values.reshape(-1, 1).double() * weight
+    count = weight.sum().clamp_min(1.0)
+    rows = (rows - rows.sum(0) / count) * weight
+    scale = (rows.square().sum(0) / count).sqrt().clamp_min(_MIN_SPREAD)
+    rows = torch.cat([rows / scale, weight], -1)
+    # The ridge keeps features that follow from others, or never change, from blowing up.
+    ridge = _RIDGE * count * torch.eye(rows.shape[-1], dtype=rows.dtype, device=rows.device)
+    weights = torch.linalg.solve(rows.T @ rows + ridge, rows.T @ target)
+    return (rows @ weights).reshape(values.shape).to(values.dtype)
 
 
 def normalise(values: torch.Tensor, *, floor: float, clip: float, mask: torch.Tensor | None = None) -> torch.Tensor:

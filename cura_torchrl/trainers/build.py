@@ -103,6 +103,7 @@ def build_advantage(config: TrainConfig, networks: Networks) -> CURAAdvantage:
         uncertainty_floor=cura.uncertainty_floor,
         cost_clip=cura.cost_clip,
         cost_lmbda=cura.cost_lmbda,
+        cost_baseline=cura.cost_baseline,
         advantage_scale=cura.advantage_scale,
         normalise_sum=cura.normalise_sum,
         seed=config.seed,

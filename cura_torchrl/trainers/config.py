@@ -103,6 +103,8 @@ class CURAConfig:
     cost_lmbda: float = 0.0
     """Lambda of an advantage estimate of the costs, which pays back later what was a cost at first [1]; 0 takes each
     step's own cost, as the paper does. Range: 0 to 1."""
+    cost_baseline: Literal["mean", "state"] = "mean"
+    """What costs are compared with: their mean (the paper), or what a linear regression on the observation predicts."""
     advantage_scale: Literal["raw", "zscore"] = "raw"
     """Scale of the advantage beside the costs: as it is (the paper), or brought to mean 0 and deviation 1 first."""
     normalise_sum: bool = True

@@ -118,6 +118,28 @@ def test_costs_can_be_accumulated_along_the_trajectory() -> None:
     assert torch.allclose(only_risk(rollout)["advantage"].flatten().double(), expected, atol=1e-5)
 
 
+def test_a_baseline_takes_out_what_the_state_explains() -> None:
+    """Catches a baseline of the wrong sign, or one that takes out what the action has done.
+
+    U(o') - U(o) is the state's U, which the regression sees, plus 0.1 or -0.1 that it does not see.
+    """
+    generator = torch.Generator().manual_seed(0)
+    state = 0.1 + torch.rand(8, 32, 2, generator=generator)
+    action = 0.1 * (2.0 * torch.randint(2, (8, 32, 1), generator=generator) - 1.0)
+    after = torch.cat([state[..., :1], 2.0 * state[..., 1:] + action], -1)
+    still = torch.zeros(8, 32, 1, dtype=torch.bool)
+    signals = {"reward": torch.zeros(8, 32, 1), "cost": still.float(), "done": still, "terminated": still}
+    rollout = TensorDict({"observation": state, "next": {"observation": after, **signals}}, [8, 32])
+    options = {"normalise_sum": False, "risk_coeff": 0.0, "gamma": 0.0, "lmbda": 0.0}
+    by_baseline = {}
+    for baseline in ("mean", "state"):
+        estimate = CURAAdvantage(_zero_critic(), _table(), cost_baseline=baseline, **options)
+        advantage = estimate(rollout.clone())["advantage"]
+        by_baseline[baseline] = torch.corrcoef(torch.stack([advantage.flatten(), action.flatten()]))[0, 1].item()
+    assert by_baseline["state"] < -0.99
+    assert by_baseline["mean"] > -0.5
+
+
 def test_the_sum_is_standardised_for_the_optimiser() -> None:
     """Catches a sum that keeps the scale of the reward, on which PPO's step size would depend."""
     critic, estimator = _networks()
