@@ -115,8 +115,8 @@ class MapVAE(nn.Module):
         latent_size: int = 32,
         channels: int = 2,
         window: int = 100,
-        widths: Sequence[int] = (16, 32, 32),
-        patch: tuple[int, int] = (5, 5),
+        widths: Sequence[int] = (16, 32, 64),
+        patch: tuple[int, int] = (4, 4),
         activation: str = "relu",
     ) -> None:
         super().__init__()

@@ -71,9 +71,9 @@ class PretrainMapConfig:
     """Standard deviation of the smooth noise on the scripted action, as a share of its range [1]."""
     latent_size: int = 32
     """Length of the code z [1]."""
-    widths: tuple[int, int, int] = (16, 32, 32)
+    widths: tuple[int, int, int] = (16, 32, 64)
     """Channels after each of the encoder's convolutions [1]."""
-    patch: tuple[int, int] = (5, 5)
+    patch: tuple[int, int] = (4, 4)
     """Kernel and stride of its first convolution [cells]."""
     activation: Literal["relu", "elu"] = "relu"
     """What follows each convolution."""

@@ -83,10 +83,10 @@ class TestMapVAE:
         assert ((shown >= 0) & (shown <= 1)).all()
 
     def test_layers_are_those_of_the_design(self) -> None:
-        """Catches a layer that makes the encoder slower: 5x5 stride 5 to 16, 3x3 stride 2 to 32, then 32."""
+        """Catches a layer that makes the encoder slower: 4x4 stride 4 to 16, 3x3 stride 2 to 32, then 64."""
         convolutions = [layer for layer in MapVAE().trunk if isinstance(layer, torch.nn.Conv2d)]
         found = [(c.in_channels, c.out_channels, c.kernel_size[0], c.stride[0]) for c in convolutions]
-        assert found == [(2, 16, 5, 5), (16, 32, 3, 2), (32, 32, 3, 2)]
+        assert found == [(2, 16, 4, 4), (16, 32, 3, 2), (32, 64, 3, 2)]
         assert MapVAE().latent_size == 32
 
     @pytest.mark.parametrize("window", [20, 33, 100])
