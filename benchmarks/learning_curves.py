@@ -1,4 +1,4 @@
-"""Draw the curves of runs side by side; a run is a method whose weights are shipped, or a folder.
+"""Draw the curves of runs side by side; a run is a method whose weights are shipped, a folder, or its progress.csv.
 
 python benchmarks/learning_curves.py cura-ppo push --output docs/_static/learning_curves.png
 """
@@ -6,6 +6,7 @@ python benchmarks/learning_curves.py cura-ppo push --output docs/_static/learnin
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from pathlib import Path
 
@@ -43,10 +44,23 @@ def rows_of(run: str) -> list[dict[str, float]]:
     """Return a run's progress.
 
     Args:
-        run: Name of a method, or folder of a run.
+        run: Name of a method, folder of a run, or file with its progress.
     """
+    if run.endswith(".csv"):
+        return read_progress(Path(run))
     source = load_policy(run).path if run in METHODS else find_checkpoint(Path(run))
     return read_progress(progress_path(source))
+
+
+def last_means(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Return the frames of a run, and means over its last updates of what tells how it does and what its costs weigh.
+
+    Args:
+        rows: Rows of a run's progress.
+    """
+    names = [name for name, _ in PANELS] + ["episode_steps", "risk_weight", "uncertainty_weight"]
+    ends = {name: smooth(rows, name)[1] for name in names}
+    return {"frames": rows[-1]["frames"]} | {name: round(values[-1], 4) for name, values in ends.items() if values}
 
 
 def main() -> None:
@@ -54,13 +68,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", help="methods whose weights are shipped, or folders of runs")
     parser.add_argument("--output", type=Path, required=True, help="picture to write")
+    parser.add_argument("--summary", type=Path, help="JSON file to write, with means over the last updates of each run")
     options = parser.parse_args()
     figure = Figure(figsize=(11, 5.6), layout="constrained")
     axes = figure.subplots(2, 3, sharex=True)
+    summary = {}
     for run in options.runs:
         rows = rows_of(run)
+        summary[Path(run).stem] = last_means(rows)
         for axis, (name, _) in zip(axes.flat, PANELS, strict=True):
-            axis.plot(*smooth(rows, name), label=Path(run).name, linewidth=1.4)
+            axis.plot(*smooth(rows, name), label=Path(run).stem, linewidth=1.4)
     for axis, (name, title) in zip(axes.flat, PANELS, strict=True):
         axis.set_title(title, loc="left", fontsize=9)
         axis.grid(alpha=0.3)
@@ -70,6 +87,8 @@ def main() -> None:
         axis.set_xlabel("environment steps [million]")
     axes.flat[0].legend()
     figure.savefig(options.output, dpi=110)
+    if options.summary is not None:
+        options.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
