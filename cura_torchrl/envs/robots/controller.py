@@ -172,7 +172,7 @@ class ImpedanceController:
         return self._parts[key]
 
     def _base_twist(self, part: _Part, yaw: Array) -> Array:
-        """Move the base's velocity command on by a tick, and return it along the world's axes."""
+        # Moves the base's velocity command on by a tick, and returns it along the world's axes.
         xp, command, twist = self._xp, part.command, part.twist
         if part.tick < len(self._plan):
             command[...] = self._plan[part.tick][part.rows]
@@ -219,7 +219,7 @@ class ImpedanceController:
         )
 
     def _plan_base(self) -> None:
-        """Work out the base's velocity commands up to the next solution: for all robots at once, as they are open loop."""
+        """Work out the base's velocity commands up to the next solution, for all robots at once: they are open loop."""
         self._plan, command = [], self.base_command
         for _ in range(self.ik_ticks):
             command = command + self._ramp_step(command, self._base_target)
