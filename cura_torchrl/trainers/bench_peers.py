@@ -72,7 +72,7 @@ def run(config: BenchConfig) -> Report:
         msg = "gymnasium is not installed; accepted: first pip install cura-torchrl[peers]"
         raise UnavailableError(msg)
     report = Report()
-    python = _panda_python(config.venv, report) if config.panda_gym else None
+    python = find_panda(config.venv, report) if config.panda_gym else None
     if not config.panda_gym:
         report.notes.append("panda-gym was left out: --panda-gym installs and measures it")
     measure_vectors(config, report)
@@ -245,8 +245,16 @@ def measure_ticks(config: BenchConfig, report: Report, python: Path | None) -> N
     report.add_ratio("panda-gym / PushEnv, time a tick and robot", later["step"], ours["PushEnv"])
 
 
-def _panda_python(venv: Path, report: Report) -> Path | None:
-    """Return the interpreter of an environment with panda-gym, made if need be; None with a note where it fails."""
+def find_panda(venv: Path, report: Report) -> Path | None:
+    """Return the interpreter of a virtual environment with panda-gym, which is made if need be.
+
+    Args:
+        venv: Its folder.
+        report: Where a note goes: with which versions it was measured, or why it was not.
+
+    Returns:
+        The interpreter; None where it cannot be had.
+    """
     python = venv / "bin" / "python"
     commands = [
         [sys.executable, "-m", "venv", str(venv)],
