@@ -106,8 +106,11 @@ def provenance() -> dict[str, Any]:
         >>> sorted(provenance())
         ['command', 'commit', 'hardware', 'versions']
     """
+    program, *arguments = sys.argv
+    # As it can be typed anywhere: the command line's own file lies somewhere else on each machine.
+    typed = ["cura-torchrl"] if Path(program).name in {"cura-torchrl", "cli.py"} else ["python", program]
     return {
-        "command": shlex.join(["python", *sys.argv]),
+        "command": shlex.join([*typed, *arguments]),
         "commit": git_commit(),
         "hardware": hardware(),
         "versions": versions(),
