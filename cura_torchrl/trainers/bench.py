@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 OUTPUT_FOLDER = Path("runs/bench")
 """Where results go unless a file is named."""
 
+BUSY_SHARE = 0.5
+"""Load average per core above which a result notes that the machine was busy [1]."""
+
 TARGETS: dict[str, Callable[[BenchConfig], Report]] = {
     "env": bench_env.run,
     "learner": bench_learner.run,
@@ -48,6 +51,12 @@ def bench(config: BenchConfig) -> dict[str, Any]:
     with one_thread():
         torch.manual_seed(config.seed)
         report = TARGETS[config.target](config)
+    cores = len(os.sched_getaffinity(0))
+    if load > BUSY_SHARE * cores:
+        report.notes.append(
+            f"the machine was busy (load average {load:.1f} on {cores} cores): figures by the clock on the wall, which are "
+            "those of several processes or threads, say nothing about an idle one"
+        )
     settings = {name: _plain(value) for name, value in dataclasses.asdict(config).items()}
     result = {**provenance(), "load_average": round(load, 2), "settings": settings, **dataclasses.asdict(report)}
     path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")

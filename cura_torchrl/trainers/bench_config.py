@@ -30,7 +30,7 @@ class BenchConfig:
     """Worlds of a process with PyBullet [1]; robots of ik."""
     num_workers: int = 2
     """Processes that are compared with one [1]; threads of what is timed by the clock on the wall in one process."""
-    sweep: tuple[int, ...] = (16, 32, 128)
+    sweep: tuple[int, ...] = (16, 32)
     """Other numbers of worlds that env tries in one process [1]."""
     planar_envs: int = 1024
     """Worlds of the planar simulator [1]."""

@@ -34,7 +34,7 @@ _MAX_RAYS = 8192
 _BLOCK = 16
 """Worlds stepped together between two IK solutions.
 
-Few enough for their state to stay in the cache, enough to share numpy's overhead.
+A compromise: with more of them numpy's overhead is shared, and each one's data have left the cache when its turn comes.
 """
 
 _BASE_LINKS = ("base_slide_x", "base_slide_y", "base_link")
