@@ -7,7 +7,7 @@ runs=${1:-runs}
 frames=${2:-1500000}
 weights=cura_torchrl/modules/weights
 export OMP_NUM_THREADS=1
-# Huge pages, where there are any: benchmarks/env_throughput.py, 32 worlds, 337 env steps/s without and 374 with them.
+# Huge pages, where there are any: PyBullet spreads a world over many pages. `cura-torchrl bench env` shows what they bring.
 export GLIBC_TUNABLES=glibc.malloc.hugetlb=1
 
 if [ ! -e "$weights/map_vae.pt" ]; then

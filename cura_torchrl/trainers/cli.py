@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from cura_torchrl.trainers.bench_config import BenchConfig
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError
@@ -50,6 +51,16 @@ class EvaluateOptions:
 
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")]
     """Policy and scenarios."""
+    json: bool = False
+    """Print nothing but the result, as JSON."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchOptions:
+    """Measure how fast the parts are, each beside a reference that is measured in turn with it."""
+
+    config: Annotated[BenchConfig, tyro.conf.arg(name="")]
+    """What is measured, and how."""
     json: bool = False
     """Print nothing but the result, as JSON."""
 
@@ -140,6 +151,15 @@ def _release(arguments: list[str]) -> None:
     options = _parse(ReleaseOptions, "release", arguments)
     folder = _import("cura_torchrl.trainers.checkpoint").export_policy(options.checkpoint, options.destination)
     sys.stdout.write(f"{folder}\n")
+
+
+def _bench(arguments: list[str]) -> None:
+    """Measure how fast the parts are, as ratios."""
+    options = _parse(BenchOptions, "bench", arguments)
+    module = _import("cura_torchrl.trainers.bench")
+    with _clean_stdout():
+        result = module.bench(options.config)
+    sys.stdout.write(json.dumps(result, indent=2) + "\n" if options.json else module.as_table(result))
 
 
 def _info(arguments: list[str]) -> None:
@@ -273,6 +293,7 @@ _COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "evaluate": _evaluate,
     "release": _release,
     "demo": _demo,
+    "bench": _bench,
     "info": _info,
 }
 

@@ -72,14 +72,28 @@ def hardware() -> dict[str, Any]:
     """Return what the machine has.
 
     Returns:
-        Platform, number of processor cores that this process may use, memory [GiB].
+        Platform, the processor's name, number of cores that this process may use, memory [GiB].
 
     Examples:
         >>> hardware()["cores"] >= 1
         True
     """
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    return {"platform": platform.platform(), "cores": len(os.sched_getaffinity(0)), "memory_gib": round(memory, 1)}
+    return {
+        "platform": platform.platform(),
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "memory_gib": round(memory, 1),
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 def provenance() -> dict[str, Any]:
@@ -92,8 +106,11 @@ def provenance() -> dict[str, Any]:
         >>> sorted(provenance())
         ['command', 'commit', 'hardware', 'versions']
     """
+    program, *arguments = sys.argv
+    # As it can be typed anywhere: the command line's own file lies somewhere else on each machine.
+    typed = ["cura-torchrl"] if Path(program).name in {"cura-torchrl", "cli.py"} else ["python", program]
     return {
-        "command": shlex.join(["python", *sys.argv]),
+        "command": shlex.join([*typed, *arguments]),
         "commit": git_commit(),
         "hardware": hardware(),
         "versions": versions(),

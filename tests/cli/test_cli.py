@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from cura_torchrl.trainers.bench_config import BenchConfig
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
@@ -53,19 +54,21 @@ def test_help_lists_every_command_and_method() -> None:
     """Catches a command that nobody finds."""
     done = run("--help")
     assert done.returncode == 0
-    for name in ("pretrain-map", "imitate", "train", "evaluate", "release", "demo", "info", *METHODS):
+    for name in ("pretrain-map", "imitate", "train", "evaluate", "release", "demo", "bench", "info", *METHODS):
         assert name in done.stdout
 
 
 @pytest.mark.parametrize(
-    ("command", "config"), [("train", TrainConfig), ("evaluate", EvaluateConfig), ("demo", DemoConfig)]
+    ("command", "config"),
+    [("train", TrainConfig), ("evaluate", EvaluateConfig), ("demo", DemoConfig), ("bench", BenchConfig)],
 )
 def test_help_lists_every_field(command: str, config: type[object]) -> None:
     """Catches a setting that can only be changed in the code, and help that has to import torch."""
     done = run(command, "--help")
     assert done.returncode == 0
     words = done.stdout.replace("│", " ").replace(",", " ").split()
-    assert [flag for flag in flags(config) if flag not in words] == []
+    positional = {"--target"}
+    assert [flag for flag in flags(config) if flag not in words and flag not in positional] == []
 
 
 def test_help_of_a_method_shows_its_own_defaults() -> None:
@@ -97,6 +100,9 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
             ["evaluate", "--method", "cura"],
             "method is 'cura' (did you mean cura-ppo?)",
         ),
+        (["bench"], "target"),
+        (["bench", "speed"], "speed"),
+        (["bench", "env", "--rounds", "0"], "rounds is 0; accepted: 1 or more"),
         (["evaluate", "--policy", "scripted", "--object-size", "nan"], "object_size is nan; accepted: finite numbers"),
     ],
 )
@@ -133,6 +139,13 @@ def test_evaluation_prints_nothing_but_json() -> None:
     done = run("evaluate", *flags_, "--episodes", "2", "--chunk", "2", "--seed", "3", "--simulator", "bullet", "--json")
     result = json.loads(done.stdout)
     assert (result["episodes"], result["scenario"], result["object_size"], result["seed"]) == (2, "adversarial", 1.0, 3)
+
+
+def test_a_benchmark_prints_nothing_but_json(tmp_path: Path) -> None:
+    """Catches the simulator's greeting or a progress bar on stdout, and a result that is not written."""
+    path = tmp_path / "ik.json"
+    done = run("bench", "ik", "--num-envs", "2", "--rounds", "1", "--output", str(path), "--json")
+    assert json.loads(done.stdout) == json.loads(path.read_text(encoding="utf-8"))
 
 
 def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:

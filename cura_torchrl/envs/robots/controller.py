@@ -63,10 +63,15 @@ class ImpedanceController:
         self._stiffness = array(robot.stiffness)
         mass = np.array([model.BASE_MASS, model.BASE_MASS, model.BASE_YAW_INERTIA])
         self._damping = array([*(mass / robot.base_time_constant), *robot.damping])
+        self._base_damping = self._damping[:BASE_DOF]
         self._torque_limit = array(model.TORQUE_LIMIT)
+        self._torque_floor = -self._torque_limit
         # The spring, less what the damper takes, may ask for no more than the joint has: else the reference runs away.
-        self._reach = self._torque_limit / self._stiffness
-        self._lag = array(robot.damping) / self._stiffness
+        reach = self._torque_limit / self._stiffness
+        self._reach = self._xp.stack([-reach, reach])[:, None]
+        arm_damping = self._damping[BASE_DOF:]
+        lag, ahead = arm_damping / self._stiffness, self.period + 0.0 * arm_damping
+        self._per_velocity = self._xp.stack([lag, ahead, arm_damping])[:, None]
         self._lower, self._upper = array(model.JOINT_LOWER), array(model.JOINT_UPPER)
         self._speed = tensor(model.VELOCITY_LIMIT)
         self._ramp = self.period * array([robot.max_base_acceleration] * 2 + [robot.max_base_yaw_acceleration])
@@ -80,8 +85,10 @@ class ImpedanceController:
         self.reference = array(zeros[:, BASE_DOF:] + self._home)
         self.base_command = array(zeros[:, :BASE_DOF].clone())
         self._base_target = array(zeros[:, :BASE_DOF].clone())
+        self._plan: list[Array] = []
+        self._parts: dict[tuple[int | None, int | None], _Part] = {}
         self._gain = array(torch.zeros(num_worlds, BASE_DOF + 7, BASE_DOF + 7, dtype=torch.float64, device=device))
-        self._rate = array(zeros[:, BASE_DOF:].clone())
+        self._reference_step = array(zeros[:, BASE_DOF:].clone())
         self.hand = HandLinearization(*self.kinematics.forward(self._home[None]), reference=self._home[None])
 
     def _array(self, tensor: torch.Tensor) -> Array:
@@ -97,6 +104,7 @@ class ImpedanceController:
         index = rows if self._is_tensor else rows.numpy()
         self.reference[index] = self._array(self._home)
         self.base_command[index] = 0.0
+        self._plan = []
         self.tcp_reference[rows] = self.tcp_reference.new_tensor(model.HOME_TCP)
         self._workspace[rows, 2, 1] = height_limit.to(self._workspace).clamp_max(self.config.workspace_z[1])
 
@@ -112,7 +120,8 @@ class ImpedanceController:
         shares = action.double().clamp(-1.0, 1.0)
         planar = shares[:, :2] / geometry.norm(shares[:, :2]).clamp_min(1.0)[:, None] * config.max_base_speed
         turn = shares[:, 2:3] * config.max_base_yaw_rate
-        self._base_target = self._array(torch.cat([planar, turn], dim=-1))
+        self._base_target[...] = self._array(torch.cat([planar, turn], dim=-1))
+        self._plan = []
         self._tcp_target = shares[:, 3:6] * config.max_tcp_speed
         self._object_xy_b = object_xy_b.clone()
         # tau = M (M + D dt + K dt^2)^-1 (...): the implicit (stable) form of the impedance law.
@@ -121,10 +130,12 @@ class ImpedanceController:
         implicit[:, diagonal, diagonal] += self._damping * self.period
         arm = diagonal[BASE_DOF:]
         implicit[:, arm, arm] += self._stiffness * self.period**2
-        self._gain = mass_matrix @ self._xp.linalg.inv(implicit)
+        self._gain[...] = mass_matrix @ self._xp.linalg.inv(implicit)
 
     def torques(self, rows: slice, position: Array, velocity: Array) -> Array:
         """Return the joint torques of one tick for consecutive robots; :meth:`solve_ik` sets where they head.
+
+        A robot belongs to the same ``rows`` from one solution to the next.
 
         Args:
             rows: Which robots, B of them.
@@ -137,24 +148,47 @@ class ImpedanceController:
         Source:
             Tan, Liu and Turk (2011), "Stable proportional-derivative controllers", eq. (11).
         """
-        xp = self._xp
-        arm_position, arm_velocity = position[:, BASE_DOF:], velocity[:, BASE_DOF:]
-        reference, command = self.reference[rows], self.base_command[rows]
-        reference += self._rate[rows] * self.period
-        centre = arm_position + self._lag * arm_velocity
-        lower, upper = xp.maximum(self._lower, centre - self._reach), xp.minimum(self._upper, centre + self._reach)
-        xp.minimum(xp.maximum(reference, lower, out=reference), upper, out=reference)
-        command += self._ramp_step(command, self._base_target[rows])
-        force = xp.empty_like(position)
-        force[:, :BASE_DOF] = self._damping[:BASE_DOF] * (
-            self._to_world(command, position[:, 2]) - velocity[:, :BASE_DOF]
-        )
-        error = reference - arm_position - self.period * arm_velocity
-        force[:, BASE_DOF:] = self._stiffness * error - self._damping[BASE_DOF:] * arm_velocity
-        torque = (self._gain[rows] @ force[:, :, None])[:, :, 0]
+        xp, part = self._xp, self._part(rows)
+        arm, reference = position[:, BASE_DOF:], part.reference
+        lag, ahead, drag = xp.multiply(velocity[:, BASE_DOF:], self._per_velocity, out=part.scaled)
+        lower, upper = xp.add(xp.add(arm, lag, out=lag), self._reach, out=part.bounds)
+        reference += part.reference_step
+        xp.maximum(xp.maximum(reference, self._lower, out=reference), lower, out=reference)
+        xp.minimum(xp.minimum(reference, self._upper, out=reference), upper, out=reference)
+        error = xp.subtract(xp.subtract(reference, arm, out=lag), ahead, out=lag)
+        xp.subtract(xp.multiply(self._stiffness, error, out=error), drag, out=part.arm_force)
+        twist = self._base_twist(part, position[:, 2])
+        xp.subtract(twist, velocity[:, :BASE_DOF], out=twist)
+        xp.multiply(self._base_damping, twist, out=part.base_force)
+        torque = xp.matmul(part.gain, part.force)[:, :, 0]
         arm = torque[:, BASE_DOF:]
-        xp.minimum(xp.maximum(arm, -self._torque_limit, out=arm), self._torque_limit, out=arm)
+        xp.minimum(xp.maximum(arm, self._torque_floor, out=arm), self._torque_limit, out=arm)
         return torque
+
+    def _part(self, rows: slice) -> _Part:
+        key = rows.start, rows.stop
+        if key not in self._parts:
+            self._parts[key] = _Part(self, rows)
+        return self._parts[key]
+
+    def _base_twist(self, part: _Part, yaw: Array) -> Array:
+        # Moves the base's velocity command on by a tick, and returns it along the world's axes.
+        xp, command, twist = self._xp, part.command, part.twist
+        if part.tick < len(self._plan):
+            command[...] = self._plan[part.tick][part.rows]
+        else:
+            command += self._ramp_step(command, part.target)
+        part.tick += 1
+        xp.cos(yaw, out=part.turn[:, 0])
+        xp.sin(yaw, out=part.turn[:, 1])
+        part.turn[:, 2] = part.turn[:, 0]
+        linear, products = command[:, :2], part.products
+        xp.multiply(part.turn[:, :2], linear, out=products)
+        xp.subtract(products[:, 0], products[:, 1], out=twist[:, 0])
+        xp.multiply(part.turn[:, 1:], linear, out=products)
+        xp.add(products[:, 0], products[:, 1], out=twist[:, 1])
+        twist[:, 2] = command[:, 2]
+        return twist
 
     def _ramp_step(self, command: Array, target: Array) -> Array:
         """Return the change of the base's velocity command in one tick, within the acceleration of each axis."""
@@ -170,15 +204,9 @@ class ImpedanceController:
         step[:, :2] = xp.where(is_fast[:, None], ramp[:, :2] / slowest, step[:, :2])
         return step
 
-    def _to_world(self, twist: Array, yaw: Array) -> Array:
-        cos, sin = self._xp.cos(yaw), self._xp.sin(yaw)
-        world = twist + 0.0
-        world[:, 0] = cos * twist[:, 0] - sin * twist[:, 1]
-        world[:, 1] = sin * twist[:, 0] + cos * twist[:, 1]
-        return world
-
     def solve_ik(self) -> None:
         """Set the rate of every joint reference from the commanded twist; due every ``ik_ticks`` ticks."""
+        self._plan_base()
         reference = torch.as_tensor(self.reference).clone()
         tcp, rotation, jacobian = self.kinematics.forward(reference)
         self.hand = HandLinearization(tcp, rotation, jacobian, reference=reference)
@@ -186,7 +214,18 @@ class ImpedanceController:
         rate, free = damped_least_squares(jacobian, twist, self.config.ik_damping)
         posture = self.config.posture_gain * (self._home - reference)
         rate = rate + (free @ posture[:, :, None])[:, :, 0]
-        self._rate = self._array(torch.maximum(torch.minimum(rate, self._speed), -self._speed))
+        self._reference_step[...] = self._array(
+            torch.maximum(torch.minimum(rate, self._speed), -self._speed) * self.period
+        )
+
+    def _plan_base(self) -> None:
+        """Work out the base's velocity commands up to the next solution, for all robots at once: they are open loop."""
+        self._plan, command = [], self.base_command
+        for _ in range(self.ik_ticks):
+            command = command + self._ramp_step(command, self._base_target)
+            self._plan.append(command)
+        for part in self._parts.values():
+            part.tick = 0
 
     def _linear(self, at: torch.Tensor) -> torch.Tensor:
         """Return the velocity that moves the TCP's reference as commanded, and follows it [m/s]."""
@@ -209,6 +248,29 @@ class ImpedanceController:
         # Sum of the cross products of the axes: twice the rotation vector to first order.
         error = 0.5 * torch.cross(rotation.mT, target.mT, dim=-1).sum(-2)
         return (config.orientation_gain * error).clamp(-config.max_hand_rate, config.max_hand_rate)
+
+
+class _Part:
+    """Consecutive robots: their rows of the controller's arrays, and work space, made once.
+
+    With a few robots, making views and arrays would take longer than the arithmetic.
+    """
+
+    def __init__(self, controller: ImpedanceController, rows: slice) -> None:
+        own = controller.base_command
+        self.rows, self.tick = rows, 0
+        self.reference, self.reference_step = controller.reference[rows], controller._reference_step[rows]
+        self.command, self.target, self.gain = own[rows], controller._base_target[rows], controller._gain[rows]
+
+        def empty(*shape: int) -> Array:
+            like = torch.as_tensor(own).new_empty(shape)
+            return controller._array(like)
+
+        count = len(self.command)
+        self.scaled, self.bounds = empty(3, count, 7), empty(2, count, 7)
+        self.turn, self.products, self.twist = empty(count, 3), empty(count, 2), empty(count, BASE_DOF)
+        self.force = empty(count, BASE_DOF + 7, 1)
+        self.base_force, self.arm_force = self.force[:, :BASE_DOF, 0], self.force[:, BASE_DOF:, 0]
 
 
 def hand_rotation(yaw: torch.Tensor, tilt: float) -> torch.Tensor:
