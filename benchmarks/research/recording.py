@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
     from cura_torchrl.envs.config import TaskConfig
+    from cura_torchrl.envs.push import PushEnv
     from cura_torchrl.trainers.checkpoint import LoadedPolicy
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -73,7 +74,11 @@ def task(loaded: LoadedPolicy, **scenario: Any) -> TaskConfig:
 
 def clearance(env: EnvBase) -> torch.Tensor:
     """Return the distance from the chassis or the object to the nearest obstacle that has appeared [m], ``[N]``."""
-    base = env.base_env
+    return gaps(env.base_env).amin(-1)
+
+
+def gaps(base: PushEnv) -> torch.Tensor:
+    """Return the distance from the chassis or the object to every obstacle [m], 20 if it is not there, ``[N, 6]``."""
     active, pose, edge = base.obstacles
     state = base.world_state
     yaw = geometry.yaw_from_quaternion(state.object_quaternion)
@@ -85,7 +90,7 @@ def clearance(env: EnvBase) -> torch.Tensor:
     distance = torch.stack([geometry.rectangle_distance(p[:, None], h[:, None], pose, square) for p, h in bodies]).amin(
         0
     )
-    return distance.masked_fill(~active, 20.0).amin(-1)
+    return distance.masked_fill(~active, 20.0)
 
 
 def unseen_ahead(maps: torch.Tensor, observation: dict[str, torch.Tensor], resolution: float) -> torch.Tensor:
