@@ -136,6 +136,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--strategies", nargs="+", default=list(STRATEGIES), choices=list(STRATEGIES))
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS, help="scenarios")
+    parser.add_argument("--sizes", nargs="+", type=float, default=list(SIZES), help="edges of the object [m]")
     parser.add_argument("--episodes", type=int, default=300, help="scenes a cell")
     parser.add_argument("--seed", type=int, default=3000, help="seed of the scenes; never 0, the evaluation's")
     parser.add_argument("--envs", type=int, default=300, help="worlds side by side")
@@ -145,7 +146,7 @@ def main() -> None:
     strategies = list(dict.fromkeys(["straight", "no occlusion", *options.strategies]))
     cells: dict[str, dict[str, Any]] = {}
     with one_thread(), torch.no_grad():
-        for kind, size in itertools.product(options.kinds, SIZES):
+        for kind, size in itertools.product(options.kinds, options.sizes):
             results = {name: outcome(*play(name, kind, size, options)) for name in strategies}
             cells[f"{kind}, {size} m"] = results
             for name, result in results.items():

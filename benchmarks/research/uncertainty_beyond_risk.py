@@ -118,12 +118,14 @@ def measure(notes: dict[str, NDArray[Any]]) -> dict[str, Any]:
         index = np.concatenate([members[episode] for episode in pick])
         risk, uncertainty, unseen, risk_cost, uncertainty_cost = (data[name][index] for name in names[:5])
         side = half[owner[index]]
-        rank = rankdata(uncertainty)
+        rank, possible = rankdata(uncertainty), (risk * (1.0 - risk)).clip(0.0)
         return np.array([
             correlation(risk, uncertainty),
             spearmanr(risk, uncertainty)[0],
             left_over(risk, uncertainty, side),
             left_over(risk, rank, side),
+            left_over(risk, uncertainty.clip(None, possible), side),
+            (uncertainty > possible).mean(),
             correlation(risk_cost, uncertainty_cost),
             left_over(risk_cost, uncertainty_cost, side),
             spearmanr(risk, unseen)[0],
@@ -148,6 +150,8 @@ STATISTICS = {
     "spearman": "rank correlation of R and U",
     "left": "share of var(U) that R leaves",
     "left_of_rank": "share of var(rank of U) that R leaves",
+    "left_of_possible": "share of var(U) that R leaves, U cut to R (1 - R)",
+    "impossible": "share of states with U above R (1 - R), the most that C in [0, 1] allows",
     "cost_pearson": "correlation of the costs",
     "cost_left": "share of var(C^U) that C^R leaves",
     "risk_unseen": "rank correlation of R and the unseen area",
@@ -164,11 +168,17 @@ def draw(notes: dict[str, NDArray[Any]], results: dict[str, Any]) -> Figure:
         xscale="log", yscale="log", bins="log", mincnt=1,
     )  # fmt: skip
     figure.colorbar(cloud, ax=scatter, label="frames [1]")
+    risk = np.linspace(1e-3, 1.0, 500)
+    scatter.plot(risk, risk * (1 - risk) + 1e-9, color="C3", linewidth=1, label="R (1 - R)")
+    scatter.set_ylim(bottom=1e-6)
+    scatter.legend(fontsize=7)
     scatter.set_xlabel("risk R [1]")
     scatter.set_ylabel("uncertainty U [1]")
     scatter.set_title("on-policy", loc="left", fontsize=9)
     place = np.arange(len(results))
-    for axis, shown in zip(bars, (("left", "left_of_rank", "cost_left"), ("risk_unseen", "rest_unseen")), strict=True):
+    for axis, shown in zip(
+        bars, (("left", "left_of_possible", "left_of_rank", "cost_left"), ("risk_unseen", "rest_unseen")), strict=True
+    ):
         for index, name in enumerate(shown):
             middle, low, high = np.array([result[name] for result in results.values()]).T
             error = np.abs(np.stack([middle - low, high - middle]))
@@ -176,7 +186,8 @@ def draw(notes: dict[str, NDArray[Any]], results: dict[str, Any]) -> Figure:
             axis.bar(spot, middle, 0.8 / len(shown), yerr=error, label=STATISTICS[name], error_kw={"elinewidth": 1})
         axis.set_xticks(place, results, rotation=30, ha="right", fontsize=8)
         axis.set_ylabel("share [1]" if shown[0] == "left" else "rank correlation [1]")
-        axis.legend(fontsize=7)
+        axis.legend(fontsize=6)
+        axis.set_ylim(top=1.5 * axis.get_ylim()[1])
         axis.grid(axis="y", alpha=0.3)
     return figure
 

@@ -79,7 +79,9 @@ class CURAAdvantage(TensorDictModuleBase):
         cost_clip: Bound on the magnitude of a normalised cost [1].
         advantage_scale: Scale of the advantage beside the costs. The letter of paper Eq. (9) is raw.
         normalise_sum: Whether to scale the penalised advantage to mean 0 and deviation 1 for the optimiser.
-        seed: Seed of the target's random choices; the generator's state is part of the state dict.
+        shuffle_uncertainty: Whether the rollout's normalised uncertainty costs are dealt out among its steps at random:
+            a placebo, with the same distribution and weight but without what it says about an action.
+        seed: Seed of the random choices of targets and placebo; the generator's state is part of the state dict.
 
     Raises:
         ValueError: If a number or ``advantage_scale`` is not acceptable.
@@ -135,6 +137,7 @@ class CURAAdvantage(TensorDictModuleBase):
         cost_clip: float = 5.0,
         advantage_scale: AdvantageScale = "raw",
         normalise_sum: bool = True,
+        shuffle_uncertainty: bool = False,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -152,6 +155,7 @@ class CURAAdvantage(TensorDictModuleBase):
         self.cost_clip = cost_clip
         self.advantage_scale = advantage_scale
         self.normalise_sum = normalise_sum
+        self.shuffle_uncertainty = shuffle_uncertainty
         self.tensor_keys = self._AcceptedKeys()
         self.register_buffer("risk_coeff", torch.tensor(float(risk_coeff)))
         self.register_buffer("uncertainty_coeff", torch.tensor(float(uncertainty_coeff)))
@@ -239,8 +243,10 @@ class CURAAdvantage(TensorDictModuleBase):
             generator=self._generator,
         )
         tensordict.set(names.collision_target, targets)
-        raw = tensordict.get(names.advantage)
-        return tensordict.set(names.advantage, self._penalise(raw, self._costs(tensordict), self._mask(tensordict)))
+        raw, costs = tensordict.get(names.advantage), self._costs(tensordict)
+        if self.shuffle_uncertainty:
+            costs = costs._replace(uncertainty=self._shuffle(costs.uncertainty, costs.uncertainty_mask))
+        return tensordict.set(names.advantage, self._penalise(raw, costs, self._mask(tensordict)))
 
     @torch.no_grad()
     def diagnostics(self, tensordict: TensorDictBase) -> dict[str, torch.Tensor]:
@@ -315,6 +321,11 @@ class CURAAdvantage(TensorDictModuleBase):
             risk_mask,
             uncertainty_mask,
         )
+
+    def _shuffle(self, values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        inside = values[mask]
+        order = torch.randperm(len(inside), generator=self._generator)
+        return values.masked_scatter(mask, inside[order.to(inside.device)])
 
     def _scale(self, advantage: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
         return standardise(advantage, mask) if self.advantage_scale == "zscore" else advantage

@@ -104,6 +104,7 @@ def build_advantage(config: TrainConfig, networks: Networks) -> CURAAdvantage:
         cost_clip=cura.cost_clip,
         advantage_scale=cura.advantage_scale,
         normalise_sum=cura.normalise_sum,
+        shuffle_uncertainty=cura.shuffle_uncertainty,
         seed=config.seed,
     )
 
