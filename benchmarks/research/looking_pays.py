@@ -20,7 +20,9 @@ from matplotlib.figure import Figure
 from recording import PERIOD, bootstrap, gaps, save
 
 from cura_torchrl import keys
+from cura_torchrl.envs import geometry
 from cura_torchrl.envs.config import LidarConfig, PushEnvConfig, ScenarioConfig, TaskConfig
+from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.trainers.evaluate import Episode, play_episodes
 from cura_torchrl.trainers.statistics import wilson_interval
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from tensordict import TensorDictBase
 
+MOVING = 0.2
+"""Speed above which the object counts as moving [m/s]."""
 SIZES = (0.5, 0.75, 1.0)
 KINDS = ("uniform", "adversarial")
 STRATEGIES: dict[str, Callable[[], SeeingPusher]] = {
@@ -47,24 +51,36 @@ STRATEGIES: dict[str, Callable[[], SeeingPusher]] = {
 """The first two bound the loss: both go straight, the second's rays pass through the object."""
 
 
-def play(strategy: str, kind: Any, size: float, options: argparse.Namespace) -> tuple[list[Episode], list[bool]]:
-    """Return how the scenes of a cell are played, and of each collision whether it was with a known obstacle."""
+def play(
+    strategy: str, kind: Any, size: float, options: argparse.Namespace
+) -> tuple[list[Episode], list[bool], torch.Tensor]:
+    """Return how the scenes of a cell are played.
+
+    Returns:
+        The episodes; of each collision whether it was with a known obstacle; how far beside the object's way the base
+        was [m], in every step in which the object moved.
+    """
     scenario = ScenarioConfig(kind=kind, object_edges=(size,), max_obstacles=options.max_obstacles)
     task = dataclasses.replace(TaskConfig(), scenario=scenario, stream="eval", privileged=True)
     lidar = LidarConfig(occlusion=strategy != "no occlusion")
     config = PushEnvConfig(simulator="planar", task=task, lidar=lidar)
-    policy, known = STRATEGIES[strategy](), []
+    policy, known, beside = STRATEGIES[strategy](), [], []
     with closing(PushEnv(min(options.envs, options.episodes), config, seed=options.seed)) as env:
 
         def watch(state: TensorDictBase, playing: torch.Tensor) -> None:
             collides = state[keys.CONTACT].any(-1) & ~state[keys.SUCCESS][:, 0] & playing
             rows = collides.nonzero().flatten()
             known.extend(policy.known[rows, gaps(env)[rows].argmin(-1)].tolist())
+            parts = {name: state[keys.OBSERVATION][:, part] for name, part in OBSERVATION_SLICES.items()}
+            centre, velocity = parts["object_position"][:, :2], parts["object_velocity"]
+            speed = geometry.norm(velocity)
+            across = (velocity[:, 0] * centre[:, 1] - velocity[:, 1] * centre[:, 0]).abs() / speed.clamp_min(1e-6)
+            beside.append(across[playing & (speed > MOVING)])
 
-        return play_episodes(env, policy, torch.arange(options.episodes), watch=watch), known
+        return play_episodes(env, policy, torch.arange(options.episodes), watch=watch), known, torch.cat(beside)
 
 
-def outcome(episodes: list[Episode], known: list[bool]) -> dict[str, Any]:
+def outcome(episodes: list[Episode], known: list[bool], beside: torch.Tensor) -> dict[str, Any]:
     """Return the counts and Wilson's intervals of a cell, and the outcomes scene by scene."""
     success = [episode.success[0] for episode in episodes]
     collision = [episode.collision for episode in episodes]
@@ -74,6 +90,7 @@ def outcome(episodes: list[Episode], known: list[bool]) -> dict[str, Any]:
         "success": [sum(success) / count, *wilson_interval(sum(success), count)],
         "collision": [sum(collision) / count, *wilson_interval(sum(collision), count)],
         "collisions_with_known": sum(known),
+        "beside_m": {f"q{round(100 * share)}": round(float(beside.quantile(share)), 3) for share in (0.5, 0.9)},
         "timeout": 1.0 - (sum(success) + sum(collision)) / count,
         "mean_seconds": PERIOD * sum(episode.steps for episode in episodes) / count,
         "outcomes": "".join("s" if s else "c" if c else "t" for s, c in zip(success, collision, strict=True)),
