@@ -87,7 +87,9 @@ class CURAAdvantage(TensorDictModuleBase):
         cost_baseline: What is subtracted from the costs; the paper has the mean.
         advantage_scale: Scale of the advantage beside the costs. The letter of paper Eq. (9) is raw.
         normalise_sum: Whether to scale the penalised advantage to mean 0 and deviation 1 for the optimiser.
-        seed: Seed of the target's random choices; the generator's state is part of the state dict.
+        shuffle_uncertainty: Whether the rollout's normalised uncertainty costs are dealt out among its steps at random:
+            a placebo, with the same distribution and weight but without what it says about an action.
+        seed: Seed of the random choices of targets and placebo; the generator's state is part of the state dict.
 
     Raises:
         ValueError: If a number, ``advantage_scale`` or ``cost_baseline`` is not acceptable.
@@ -145,6 +147,7 @@ class CURAAdvantage(TensorDictModuleBase):
         cost_baseline: CostBaseline = "mean",
         advantage_scale: AdvantageScale = "raw",
         normalise_sum: bool = True,
+        shuffle_uncertainty: bool = False,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -164,6 +167,7 @@ class CURAAdvantage(TensorDictModuleBase):
         self.cost_baseline = cost_baseline
         self.advantage_scale = advantage_scale
         self.normalise_sum = normalise_sum
+        self.shuffle_uncertainty = shuffle_uncertainty
         self.tensor_keys = self._AcceptedKeys()
         self.register_buffer("risk_coeff", torch.tensor(float(risk_coeff)))
         self.register_buffer("uncertainty_coeff", torch.tensor(float(uncertainty_coeff)))
@@ -251,8 +255,10 @@ class CURAAdvantage(TensorDictModuleBase):
             generator=self._generator,
         )
         tensordict.set(names.collision_target, targets)
-        raw = tensordict.get(names.advantage)
-        return tensordict.set(names.advantage, self._penalise(raw, self._costs(tensordict), self._mask(tensordict)))
+        raw, costs = tensordict.get(names.advantage), self._costs(tensordict)
+        if self.shuffle_uncertainty:
+            costs = costs._replace(uncertainty=self._shuffle(costs.uncertainty, costs.uncertainty_mask))
+        return tensordict.set(names.advantage, self._penalise(raw, costs, self._mask(tensordict)))
 
     @torch.no_grad()
     def diagnostics(self, tensordict: TensorDictBase) -> dict[str, torch.Tensor]:
@@ -335,6 +341,11 @@ class CURAAdvantage(TensorDictModuleBase):
             risk_mask,
             uncertainty_mask,
         )
+
+    def _shuffle(self, values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        inside = values[mask]
+        order = torch.randperm(len(inside), generator=self._generator)
+        return values.masked_scatter(mask, inside[order.to(inside.device)])
 
     def _scale(self, advantage: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
         return standardise(advantage, mask) if self.advantage_scale == "zscore" else advantage

@@ -54,8 +54,8 @@ def bench(config: BenchConfig) -> dict[str, Any]:
     cores = len(os.sched_getaffinity(0))
     if load > BUSY_SHARE * cores:
         report.notes.append(
-            f"the machine was busy (load average {load:.1f} on {cores} cores): figures by the clock on the wall, which are "
-            "those of several processes or threads, say nothing about an idle one"
+            f"the machine was busy (load average {load:.1f} on {cores} cores): figures by the clock on the wall, which "
+            "are those of several processes or threads, say nothing about an idle one"
         )
     settings = {name: _plain(value) for name, value in dataclasses.asdict(config).items()}
     result = {**provenance(), "load_average": round(load, 2), "settings": settings, **dataclasses.asdict(report)}

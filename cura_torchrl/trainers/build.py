@@ -106,6 +106,7 @@ def build_advantage(config: TrainConfig, networks: Networks) -> CURAAdvantage:
         cost_baseline=cura.cost_baseline,
         advantage_scale=cura.advantage_scale,
         normalise_sum=cura.normalise_sum,
+        shuffle_uncertainty=cura.shuffle_uncertainty,
         seed=config.seed,
     )
 

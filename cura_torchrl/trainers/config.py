@@ -109,6 +109,8 @@ class CURAConfig:
     """Scale of the advantage beside the costs: as it is (the paper), or brought to mean 0 and deviation 1 first."""
     normalise_sum: bool = True
     """Whether the advantage with its costs is brought to mean 0 and deviation 1 for the optimiser."""
+    shuffle_uncertainty: bool = False
+    """Whether the uncertainty cost is dealt out among a rollout's steps at random: a placebo for experiments."""
     costs_start_frames: int = 100_000
     """Frames for which the estimator is trained before its costs enter the advantage [1]."""
     lr: float = 5e-4

@@ -72,13 +72,14 @@ def cost_to_go(cost: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
     value = torch.full_like(cost, _FAR * _FAR)
     column, row = cell_of(goal)
     value[torch.arange(len(cost)), column, row] = 0.0
+    lengths = {True: cost * 2**0.5, False: cost}
     for _ in range(2 * (_SHAPE[0] + _SHAPE[1])):
         padded = torch.nn.functional.pad(value, (1, 1, 1, 1), value=_FAR * _FAR)
-        around = [
-            padded[:, 1 + dx : 1 + dx + _SHAPE[0], 1 + dy : 1 + dy + _SHAPE[1]] + cost * (dx * dx + dy * dy) ** 0.5
-            for dx, dy in _NEIGHBOURS
-        ]
-        relaxed = torch.minimum(value, torch.stack(around).amin(0))
+        relaxed, candidate = value.clone(), torch.empty_like(value)
+        for dx, dy in _NEIGHBOURS:
+            neighbour = padded[:, 1 + dx : 1 + dx + _SHAPE[0], 1 + dy : 1 + dy + _SHAPE[1]]
+            torch.add(neighbour, lengths[dx != 0 and dy != 0], out=candidate)
+            torch.minimum(relaxed, candidate, out=relaxed)
         if torch.equal(relaxed, value):
             break
         value = relaxed

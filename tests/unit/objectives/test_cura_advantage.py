@@ -148,6 +148,23 @@ def test_the_sum_is_standardised_for_the_optimiser() -> None:
     assert torch.allclose(advantage, (plain - plain.mean()) / plain.std(), atol=1e-6)
 
 
+def test_the_placebo_deals_the_same_uncertainty_costs_to_other_steps() -> None:
+    """Catches a placebo that changes the costs' distribution, reaches terminal steps or leaves the costs in place."""
+    critic, estimator = _networks()
+    plain, placebo = (
+        CURAAdvantage(
+            critic, estimator, risk_coeff=0.0, uncertainty_coeff=1.0, normalise_sum=False, shuffle_uncertainty=shuffled
+        )(_rollout())
+        for shuffled in (False, True)
+    )
+    raw = plain["value_target"] - plain["state_value"]
+    terminated = plain["next", "terminated"]
+    costs, dealt = ((raw - rollout["advantage"])[~terminated] for rollout in (plain, placebo))
+    torch.testing.assert_close(dealt.sort().values, costs.sort().values, atol=1e-5, rtol=0.0)  # sums of floats about 5
+    assert (dealt - costs).abs().max() > 0.1
+    torch.testing.assert_close(placebo["advantage"][terminated], plain["advantage"][terminated])
+
+
 def test_zscore_scales_the_advantage_before_the_costs() -> None:
     """Catches an option without effect: with the reward times 100 the costs keep their share."""
     critic, estimator = _zero_critic(), _table()
