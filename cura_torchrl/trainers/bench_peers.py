@@ -23,7 +23,7 @@ from cura_torchrl.trainers.errors import UnavailableError
 try:
     import gymnasium
 except ImportError:
-    gymnasium = None
+    gymnasium = None  # type: ignore[assignment]
 
 if TYPE_CHECKING:
     from collections.abc import Callable
