@@ -69,7 +69,10 @@ def _spread(source: torch.Tensor, target: torch.Tensor, row: int) -> torch.Tenso
     if len(axes) != 1:
         msg = f"shapes {tuple(source.shape)} and {tuple(target.shape)} differ along axes {axes}; accepted: one"
         raise ValueError(msg)
-    return source.narrow(axes[0], row, 1).expand_as(target).clone()
+    value = source.narrow(axes[0], row, 1).expand_as(target)
+    if 0 in target.stride():
+        return value.clone()
+    return target.copy_(value)  # in place: parts of the environment hold views of one another's arrays
 
 
 def vary(env: EnvBase, seeds: torch.Tensor) -> None:

@@ -100,7 +100,7 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
             ["evaluate", "--method", "cura"],
             "method is 'cura' (did you mean cura-ppo?)",
         ),
-        (["bench"], "target"),
+        (["bench"], "env,learner,lidar,ik,peers"),
         (["bench", "speed"], "speed"),
         (["bench", "env", "--rounds", "0"], "rounds is 0; accepted: 1 or more"),
         (["evaluate", "--policy", "scripted", "--object-size", "nan"], "object_size is nan; accepted: finite numbers"),
