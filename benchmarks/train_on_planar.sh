@@ -2,7 +2,8 @@
 # Trains methods on the planar simulator, side by side with a process each, from one warm start.
 # Run it again after an interruption, or with more frames: each run goes on from where it was.
 #   benchmarks/train_on_planar.sh RUNS FRAMES METHOD...
-# ENCODER=<file> takes another encoder than the one that is shipped, SEED=<n> another seed.
+# ENCODER=<file> takes another encoder than the one that is shipped, SEED=<n> another seed. benchmarks/training/map_vae.pt is the
+# encoder of both simulators' maps that the experiments in docs/research were run with.
 set -euo pipefail
 runs=$1 frames=$2
 shift 2
