@@ -7,14 +7,15 @@ encoders in turn, by processor time: python benchmarks/encoder_shapes.py runs/sh
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import statistics
-import time
 from pathlib import Path
 
 import torch
 
 from cura_torchrl.modules import MapVAE
+from cura_torchrl.trainers.bench_report import measure, timed
 from cura_torchrl.trainers.info import provenance
 from cura_torchrl.trainers.pretrain_map import FIGURES_NAME, WEIGHTS_NAME
 
@@ -28,14 +29,8 @@ def seconds_of_a_batch(encoders: dict[str, MapVAE], batch: int, rounds: int) -> 
         rounds: How often each is timed, all in turn [1].
     """
     maps = torch.rand(batch, 2, 100, 100)
-    times: dict[str, list[float]] = {name: [] for name in encoders}
-    for _ in range(rounds + 1):
-        for name, encoder in encoders.items():
-            start = time.process_time()
-            with torch.no_grad():
-                encoder(maps)
-            times[name].append(time.process_time() - start)
-    return {name: statistics.median(taken[1:]) for name, taken in times.items()}
+    plays = {name: timed(functools.partial(encoder.requires_grad_(False), maps)) for name, encoder in encoders.items()}
+    return {name: statistics.median(taken) for name, taken in measure(plays, rounds, "encoders").items()}
 
 
 def main() -> None:

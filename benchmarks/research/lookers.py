@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import torch
+from recording import PERIOD
 
 from cura_torchrl import keys
 from cura_torchrl.envs import geometry
@@ -15,8 +16,6 @@ from cura_torchrl.envs.sensors.lidar import ray_angles
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
 
-PERIOD = 0.2
-"""Time of a policy step [s]."""
 _HIT = 0.06
 """How far from an obstacle's outline a ray that hit it may end [m]; six deviations of the noise."""
 _PUSH, _OUT, _BACK = 0, 1, 2

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from tensordict import TensorDictBase
+    from torchrl.envs import EnvBase
 
     from cura_torchrl.envs.config import Simulator
     from cura_torchrl.trainers.bench_config import BenchConfig
@@ -301,11 +302,26 @@ def play(simulator: Simulator, num_envs: int, steps: int, clock: Callable[[], fl
     """
     env, data = _ENVS[simulator, num_envs]
     start = clock()
-    for _ in range(steps):
-        data = env.step_and_maybe_reset(env.rand_action(data))[1]
+    data = act_at_random(env, data, steps)
     seconds = clock() - start
     _ENVS[simulator, num_envs] = env, data
     return seconds
+
+
+def act_at_random(env: EnvBase, data: TensorDictBase, steps: int) -> TensorDictBase:
+    """Play random actions with automatic resets.
+
+    Args:
+        env: Environment.
+        data: What it observed last.
+        steps: Policy steps.
+
+    Returns:
+        What it observes then.
+    """
+    for _ in range(steps):
+        data = env.step_and_maybe_reset(env.rand_action(data))[1]
+    return data
 
 
 def play_planar(config: BenchConfig) -> float:

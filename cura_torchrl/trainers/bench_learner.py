@@ -88,19 +88,21 @@ def measure_loss(config: BenchConfig, report: Report) -> None:
     minibatch[keys.ADVANTAGE], minibatch[keys.VALUE_TARGET] = torch.randn(2, batch, 1)
     ours, theirs = CURALoss(actor, critic, estimator), ClipPPOLoss(actor, critic)
 
-    def play(loss: ClipPPOLoss) -> None:
-        losses = loss(minibatch)
-        sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
-
     def ppo_and_estimator() -> None:
-        play(theirs)
+        _pass(theirs, minibatch)
         estimator(minibatch.select(*estimator.in_keys))[keys.COLLISION_ATOMS].sum().backward()
 
-    plays = {"CURALoss": timed(functools.partial(play, ours)), "reference": timed(ppo_and_estimator)}
+    plays = {"CURALoss": timed(functools.partial(_pass, ours, minibatch)), "reference": timed(ppo_and_estimator)}
     taken = measure(plays, 5 * config.rounds, "losses")
     report.add_figure(f"CURALoss, {batch} samples", rates(batch, taken["CURALoss"]), "samples/s")
     name = "CURALoss / (ClipPPOLoss + estimator's passes)"
     report.add_ratio(name, taken["CURALoss"], taken["reference"], "<= 1.15")
+
+
+def _pass(loss: ClipPPOLoss, minibatch: TensorDict) -> None:
+    """Take the losses of a minibatch, forward and backward."""
+    losses = loss(minibatch)
+    sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
 
 
 def all_pairs(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -164,16 +166,12 @@ def measure_update(config: BenchConfig, report: Report) -> None:
     learner, rollout = Learner(train, Networks(train)), make_rollout(rows, steps)
     with torch.no_grad():
         learner.networks.actor(rollout)
-    loss = learner._loss_module
     minibatch = rollout.reshape(-1)[: ppo.minibatch_size].clone()
     minibatch[keys.ADVANTAGE], minibatch[keys.VALUE_TARGET] = torch.randn(2, len(minibatch), 1)
     minibatch[keys.COLLISION_TARGET] = torch.rand(len(minibatch), train.cura.num_atoms)
 
-    def passes() -> None:
-        losses = loss(minibatch)
-        sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
-
-    plays = {"update": timed(functools.partial(learner.update, rollout)), "one pass": timed(passes)}
+    one_pass = functools.partial(_pass, learner._loss_module, minibatch)
+    plays = {"update": timed(functools.partial(learner.update, rollout)), "one pass": timed(one_pass)}
     taken = measure(plays, config.rounds, "updates")
     count = ppo.epochs * (rows * steps // ppo.minibatch_size)
     report.add_figure(

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import functools
 import itertools
-import math
 from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
 
 from cura_torchrl import keys
-from cura_torchrl.envs import geometry
 from cura_torchrl.envs.config import LidarConfig, MapConfig
 from cura_torchrl.envs.push import PushEnv
+from cura_torchrl.envs.sensors import MapGrid, seen_free
 from cura_torchrl.envs.sensors.lidar import Lidar, ray_ends
 from cura_torchrl.envs.simulation.bullet_floor import BulletFloor
 from cura_torchrl.envs.transforms import ConfidenceMap
@@ -73,28 +72,19 @@ def measure_scan(env: PushEnv, config: BenchConfig, report: Report) -> None:
     report.add_ratio("scan / rayTestBatch alone", taken["scan"], taken["rays"])
 
 
-def see_all_cells(scan: torch.Tensor, pose: torch.Tensor, config: MapConfig, lidar: LidarConfig) -> torch.Tensor:
+def see_all_cells(scan: torch.Tensor, pose: torch.Tensor, config: MapConfig) -> torch.Tensor:
     """Return which cells of the global map a scan sees free, from the bearing and the distance of each of them.
 
     Args:
         scan: Ranges [m], shape ``[B, R]``.
         pose: Sensor (x [m], y [m], yaw [rad]), shape ``[B, 3]``.
         config: Extent and resolution.
-        lidar: Number of rays.
 
     Returns:
         Whether a cell's centre is nearer than the range at its bearing, less half its diagonal, ``[B, X, Y]``.
     """
-    x, y = (
-        torch.arange(round((high - low) / config.resolution)) * config.resolution + low + config.resolution / 2
-        for low, high in (config.extent_x, config.extent_y)
-    )
-    centres = torch.stack(torch.meshgrid(x, y, indexing="ij"), -1).reshape(1, -1, 2)
-    local = geometry.to_frame(pose[:, None].float(), centres.expand(len(pose), -1, -1))
-    turn = (torch.atan2(local[..., 1], local[..., 0]) + math.pi) / (2.0 * math.pi)
-    ray = (turn * lidar.num_rays).round().long() % lidar.num_rays
-    free = local.norm(dim=-1) < scan.gather(1, ray) - config.resolution * math.sqrt(0.5)
-    return free.reshape(len(pose), len(x), len(y))
+    grid = MapGrid(extent_x=config.extent_x, extent_y=config.extent_y, resolution=config.resolution)
+    return grid.inside(seen_free(grid.row_x(), grid.column_y(), scan, pose.float(), grid.half_diagonal))
 
 
 def measure_map(scans: TensorDict, config: BenchConfig, report: Report) -> torch.Tensor:
@@ -114,7 +104,7 @@ def measure_map(scans: TensorDict, config: BenchConfig, report: Report) -> torch
     few = inputs[: max(1, count // 16)]  # its work space is large
 
     def all_cells() -> None:
-        see_all_cells(few[keys.SCAN], few[keys.SENSOR_POSE], MapConfig(), lidar)
+        see_all_cells(few[keys.SCAN], few[keys.SENSOR_POSE], MapConfig())
 
     plays = {"map": timed(lambda: transform(inputs.clone(False))), "all cells": timed(all_cells)}
     taken = measure(plays, config.rounds, "maps")

@@ -196,8 +196,7 @@ def measure_vectors(config: BenchConfig, report: Report) -> None:
 def _play_torchrl(env: ParallelEnv, steps: int) -> float:
     data = env.reset()
     start = time.perf_counter()
-    for _ in range(steps):
-        data = env.step_and_maybe_reset(env.rand_action(data))[1]
+    bench_env.act_at_random(env, data, steps)
     return time.perf_counter() - start
 
 

@@ -193,15 +193,7 @@ def mark_free(
     sensor_pose: torch.Tensor,
     margin: float,
 ) -> None:
-    """Do what :func:`.map_tensors.mark_free` does, on the CPU.
-
-    Args:
-        axes: World x of the rows' and world y of the columns' cell centres [m], shapes ``[X]`` and ``[Y]``.
-        stamps: Stored maps, changed in place, shape ``[N, X, Y]``.
-        steps: Time, no less than any stamp [1], shape ``[N]``.
-        scan: Ranges as from :func:`~.visibility.clean_scan` [m], shape ``[N, R]``.
-        sensor_pose: Sensor (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, 3]``.
-        margin: What is taken off each range [m].
+    """Do what :func:`.map_tensors.mark_free` does, with the same arguments, on the CPU.
 
     Examples:
         >>> stamps, centres = torch.zeros(1, 1, 3), torch.tensor([1.0, 2.0, 3.0])
@@ -230,18 +222,7 @@ def mark_hits(
     rectangles: tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor],
     longest: float,
 ) -> None:
-    """Do what :func:`.map_tensors.mark_hits` does, on the CPU.
-
-    Args:
-        grid: The maps' cells.
-        stamps: Stored maps, changed in place, shape ``[N, num_rows, num_columns]``.
-        steps: Time, no less than any stamp [1], shape ``[N]``.
-        scan: Ranges as from :func:`~.visibility.clean_scan` [m], shape ``[N, R]``.
-        directions: Unit vectors along the rays in the base frame [1], shape ``[2, R]``.
-        rectangles: Sensor's pose ``[N, 3]`` and the robot's (length, width) around it ``[N, 2]``, then the object's
-            pose and size likewise (x [m], y [m], yaw [rad], world frame) [m]: what rays end on inside is no obstacle.
-        longest: Ranges from here on have hit nothing [m].
-    """
+    """Do what :func:`.map_tensors.mark_hits` does, with the same arguments, on the CPU."""
     pose, robot_size, object_pose, object_size = rectangles
     batch = (stamps.flatten(1), steps, scan, _placed(pose, robot_size), _placed(object_pose, object_size))
     numbers = (grid.extent_x[0], grid.extent_y[0], grid.resolution, grid.num_x, grid.num_y)
@@ -263,18 +244,7 @@ def fill_windows(
     frames: tuple[WindowFrame, WindowFrame],
     tables: tuple[torch.Tensor, torch.Tensor],
 ) -> None:
-    """Do what :func:`.map_tensors.fill_windows` does, on the CPU.
-
-    Args:
-        grid: The maps' cells.
-        windows: Windows to write, shape ``[N, C, W, W]``.
-        stamps: Stored maps: the time a cell was last seen, plus a half if it was occupied, shape
-            ``[N, num_rows, num_columns]``.
-        steps: Time now [1], shape ``[N]``.
-        frames: Places of the windows' cells on the map and on the object.
-        tables: Occupancy per half of a stamp, 0 where none is shown, shape ``[W, W]``; confidence by age, shape
-            ``[K]``, its last entry for all ages beyond.
-    """
+    """Do what :func:`.map_tensors.fill_windows` does, with the same arguments, on the CPU."""
     rows = torch.cat([frame.rows[..., 0] for frame in frames]).movedim(1, 0).contiguous()
     columns = torch.cat([frame.columns[..., 0, :] for frame in frames]).movedim(1, 0).contiguous()
     size = (grid.num_x, grid.num_y, grid.num_columns)

@@ -145,7 +145,7 @@ def test_all_cells_are_seen_up_to_the_range():
     lidar, grid = LidarConfig(), MapConfig()
     scan = torch.zeros(1, lidar.num_rays)
     scan[0, 3 * lidar.num_rays // 4 - 20 : 3 * lidar.num_rays // 4 + 20] = 2.0  # rays start behind: left is at 3/4
-    free = see_all_cells(scan, torch.tensor([[0.05, 0.05, 0.0]]), grid, lidar)[0]
+    free = see_all_cells(scan, torch.tensor([[0.05, 0.05, 0.0]]), grid)[0]
 
     def at(x: float, y: float) -> bool:
         return bool(free[round((x - grid.extent_x[0]) / 0.1 - 0.5), round((y - grid.extent_y[0]) / 0.1 - 0.5)])
