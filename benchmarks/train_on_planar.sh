@@ -1,32 +1,40 @@
 #!/usr/bin/env bash
-# Trains methods on the planar simulator, side by side with a process each, from one warm start.
-# Run it again after an interruption, or with more frames: each run goes on from where it was.
-#   benchmarks/train_on_planar.sh RUNS FRAMES METHOD...
-# ENCODER=<file> takes another encoder than the one that is shipped, SEED=<n> another seed. benchmarks/training/map_vae.pt is the
-# encoder of both simulators' maps that the experiments in docs/research were run with.
+# Trains methods on the planar simulator, one after the other, each from a warm start that imitates the scripted avoider with what the
+# method sees. Run it again after an interruption, or with more frames: each run goes on from where it was.
+#   benchmarks/train_on_planar.sh RUNS FRAMES METHOD... [-- FLAG...]
+# FLAG... is handed to `cura-torchrl train`. ENCODER=<file> takes another encoder than the one that is shipped, SEED=<n> another seed,
+# NAME=<folder> another name than METHOD-SEED. benchmarks/training/map_vae.pt is the encoder of both simulators' maps that the
+# experiments in docs/research were run with.
 set -euo pipefail
 runs=$1 frames=$2
 shift 2
+methods=()
+while [ $# -gt 0 ] && [ "$1" != -- ]; do
+  methods+=("$1")
+  shift
+done
+[ $# -eq 0 ] || shift
 seed=${SEED:-0}
+encoder=(${ENCODER:+--encoder "$ENCODER"})
 export OMP_NUM_THREADS=1
 
-if [ ! -d "$runs/imitate/checkpoints" ]; then
-  cura-torchrl imitate --run-dir "$runs/imitate"
-fi
-
-pids=()
-for method in "$@"; do
-  run=$runs/$method-$seed
-  if [ -d "$run/checkpoints" ]; then
-    cura-torchrl train --run-dir "$run" --total-frames "$frames" --resume &
-  else
-    cura-torchrl train --method "$method" --simulator planar --num-envs 1024 --total-frames "$frames" --seed "$seed" \
-      --run-dir "$run" --init-from "$runs/imitate" ${ENCODER:+--encoder "$ENCODER"} --ppo.rollout-steps 24 \
-      --ppo.minibatch-size 2048 --ppo.lr 3e-4 --ppo.critic-warmup-frames 100000 --ppo.entropy-coeff 0.001 \
-      --ppo.target-kl 0.02 --network.min-std 0.15 --learner-threads 1 &
+for method in "${methods[@]}"; do
+  # The warm start depends on what the LiDAR and the map show, not on the costs: methods that see the same share it.
+  case $method in
+    push | push-no-occlusion) sees=$method ;;
+    *) sees=push-conf ;;
+  esac
+  start=$runs/imitate-$sees run=$runs/${NAME:-$method-$seed}
+  if [ ! -d "$start/checkpoints" ]; then
+    cura-torchrl imitate --run-dir "$start" --expert avoider --method "$sees" --simulator planar "${encoder[@]}" --num-envs 1024 \
+      --rounds 6 --steps 150 --epochs 10 --minibatch-size 2048
   fi
-  pids+=($!)
-done
-for pid in "${pids[@]}"; do
-  wait "$pid"
+  if [ -d "$run/checkpoints" ]; then
+    cura-torchrl train --run-dir "$run" --total-frames "$frames" --resume
+  else
+    cura-torchrl train --method "$method" --simulator planar --num-envs 1024 --num-workers 2 --total-frames "$frames" --seed "$seed" \
+      --run-dir "$run" --init-from "$start" "${encoder[@]}" --ppo.rollout-steps 24 --ppo.minibatch-size 6144 --ppo.lr 3e-4 \
+      --ppo.critic-warmup-frames 250000 --cura.costs-start-frames 250000 --ppo.entropy-coeff 0.001 --ppo.target-kl 0.02 \
+      --network.min-std 0.15 --env.task.curriculum 0 6 "$@"
+  fi
 done

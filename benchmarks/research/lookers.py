@@ -11,13 +11,11 @@ from cura_torchrl import keys
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.robots import route
 from cura_torchrl.envs.robots.scripted import ScriptedAvoider
-from cura_torchrl.envs.sensors.lidar import ray_angles
+from cura_torchrl.trainers.active_perception import obstacles_hit
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
 
-_HIT = 0.06
-"""How far from an obstacle's outline a ray that hit it may end [m]; six deviations of the noise."""
 _PUSH, _OUT, _BACK = 0, 1, 2
 """What a peeking pusher does: push, move aside until it has seen enough, come back behind the object."""
 
@@ -52,7 +50,8 @@ class SeeingPusher(ScriptedAvoider):
         elapsed = tensordict[keys.ELAPSED_STEPS][:, 0]
         fresh = elapsed == 0 if len(self.known) == len(elapsed) else torch.ones_like(elapsed, dtype=torch.bool)
         self._forget(fresh)
-        self.known = self.known | self._hits(tensordict)
+        seen = (tensordict[key] for key in (keys.SCAN, keys.SENSOR_POSE, keys.OBSTACLES))
+        self.known = self.known | obstacles_hit(*seen, self.max_range)
         obstacles = tensordict[keys.OBSTACLES].clone()
         obstacles[..., 3] *= self.known
         seen = super().forward(tensordict.copy().set(keys.OBSTACLES, obstacles))
@@ -64,17 +63,6 @@ class SeeingPusher(ScriptedAvoider):
         if len(self.known) != len(rows):
             self.known = torch.zeros(len(rows), 6, dtype=torch.bool)
         self.known[rows] = False
-
-    def _hits(self, tensordict: TensorDictBase) -> torch.Tensor:
-        """Return which obstacles the scan has hit, bool, shape ``[N, 6]``."""
-        scan, pose, obstacles = tensordict[keys.SCAN], tensordict[keys.SENSOR_POSE], tensordict[keys.OBSTACLES]
-        angle = ray_angles(scan.shape[-1]).float() + pose[:, 2:]
-        ends = pose[:, None, :2] + scan[..., None] * torch.stack([angle.cos(), angle.sin()], dim=-1)
-        ends = ends[:, None].expand(-1, obstacles.shape[1], -1, -1)
-        local = geometry.to_frame(obstacles[:, :, None, :3].expand(*ends.shape[:-1], 3), ends).abs()
-        off = (local - obstacles[:, :, None, 3:] / 2).clamp_min(0.0).amax(-1)
-        hit = (off < _HIT) & (scan < self.max_range - _HIT)[:, None]
-        return hit.any(-1) & (obstacles[..., 3] > 0)
 
 
 class WeavingPusher(SeeingPusher):

@@ -19,6 +19,7 @@ from cura_torchrl.envs import geometry
 from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.objectives.functional import normalise, risk_cost, uncertainty_cost
+from cura_torchrl.trainers.active_perception import unseen_ahead
 from cura_torchrl.trainers.info import provenance
 
 if TYPE_CHECKING:
@@ -36,10 +37,6 @@ PERIOD = 0.2
 """Time of a policy step [s]."""
 BURN_IN = 64
 """Steps that are played before recording, in which episodes that begin together spread out [1]."""
-AHEAD = 2.5
-"""How far past the object's far face the area ahead of it reaches [m]."""
-MARGIN = 0.3
-"""How much wider than the object, on either side, the area ahead of it is [m]."""
 
 
 def parser(description: str | None, output: str) -> argparse.ArgumentParser:
@@ -93,26 +90,6 @@ def gaps(base: PushEnv) -> torch.Tensor:
     return distance.masked_fill(~active, 20.0)
 
 
-def unseen_ahead(maps: torch.Tensor, observation: dict[str, torch.Tensor], resolution: float) -> torch.Tensor:
-    """Return the mean of 1 - M over the area ahead of the object, away from the base [1], shape ``[N]``.
-
-    Args:
-        maps: Windows of the map, shape ``[N, C, W, W]``; the first channel is the confidence M.
-        observation: Parts of the observation by name.
-        resolution: Edge of a cell [m].
-    """
-    centre, half = observation["object_position"][:, :2], observation["object_position"][:, 2:]
-    ahead = centre / geometry.norm(centre)[:, None].clamp_min(1e-6)
-    left = torch.stack([-ahead[:, 1], ahead[:, 0]], dim=-1)
-    along = torch.linspace(0.05, AHEAD, 25)[None, :, None, None]
-    across = torch.linspace(-1.0, 1.0, 13)[None, None, :, None] * (half + MARGIN)[:, None, None]
-    points = centre[:, None, None] + (half[:, None, None] + along) * ahead[:, None, None] + across * left[:, None, None]
-    size = maps.shape[-1]
-    cell = (points / resolution + size / 2).long().clamp(0, size - 1)
-    rows = torch.arange(len(maps))[:, None, None]
-    return 1.0 - maps[rows, 0, cell[..., 0], cell[..., 1]].mean((1, 2))
-
-
 @torch.no_grad()
 def record(
     env: EnvBase, policy: Policy, steps: int, watch: Callable[[TensorDictBase], dict[str, torch.Tensor]]
@@ -156,10 +133,13 @@ def estimator_watch(loaded: LoadedPolicy, env: EnvBase) -> Callable[[TensorDictB
     def watch(state: TensorDictBase) -> dict[str, torch.Tensor]:
         outputs = loaded.collision_estimator(state.select(keys.OBSERVATION, keys.LATENT))
         parts = {name: state[keys.OBSERVATION][..., part] for name, part in OBSERVATION_SLICES.items()}
+        centre, half = parts["object_position"][:, :2], parts["object_position"][:, 2:]
+        away = centre / geometry.norm(centre)[:, None].clamp_min(1e-6)
+        unseen = unseen_ahead(state[keys.CONFIDENCE_MAP], centre, half, away, loaded.config.map.resolution)
         return {
             "risk": outputs[keys.RISK].squeeze(-1),
             "uncertainty": outputs[keys.UNCERTAINTY].squeeze(-1),
-            "unseen": unseen_ahead(state[keys.CONFIDENCE_MAP], parts, loaded.config.map.resolution),
+            "unseen": unseen,
             "clearance": clearance(env).float(),
         }
 

@@ -1,8 +1,15 @@
-"""A warm start: networks that imitate the scripted pusher where there are no obstacles.
+"""A warm start: networks that imitate a scripted pusher.
 
-Obstacle-free pushing is what all methods have in common, and on PyBullet it costs PPO millions of frames. Imitation
-learns it from a few ten thousand (dataset aggregation: the learner drives, the expert labels), and ``train
---init-from`` goes on from there with any method. It sees neither map nor obstacles, so it favours none.
+Dataset aggregation (the learner drives, the expert labels) learns from little what costs PPO millions of frames, and
+``train --init-from`` goes on from there. The expert decides what is left for PPO:
+
+- ``scripted`` pushes where there are no obstacles, what all methods have in common. The networks see neither map nor
+  obstacles, so one warm start serves every method and favours none.
+- ``avoider`` steers around every obstacle, seen or not. The networks see what their method sees of it, so every method
+  has a warm start of its own, made in the same way; what the map does not show, they cannot copy.
+
+Source:
+    Ross et al. (2011), "A Reduction of Imitation Learning and Structured Prediction to No-Regret Online Learning".
 """
 
 from __future__ import annotations
@@ -11,34 +18,47 @@ import dataclasses
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import torch
-from tensordict import TensorDict
 from tqdm import tqdm
 
 from cura_torchrl import keys
-from cura_torchrl.envs.config import require, require_finite
-from cura_torchrl.envs.robots.scripted import ScriptedPusher
-from cura_torchrl.trainers.build import LATENT_SIZE, Networks, make_env
+from cura_torchrl.envs.config import Simulator, require, require_finite
+from cura_torchrl.envs.robots.scripted import ScriptedAvoider, ScriptedPusher
+from cura_torchrl.trainers.build import Networks, make_env
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
 from cura_torchrl.trainers.methods import method
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
+    from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
     from cura_torchrl.trainers.config import TrainConfig
 
 logger = logging.getLogger(__name__)
 
+Expert = Literal["scripted", "avoider"]
+
+_SEEN_KEYS = (keys.OBSERVATION, keys.LATENT)
+"""What the networks read."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImitateConfig:
-    """Imitate the scripted pusher without obstacles."""
+    """Imitate a scripted pusher."""
 
     run_dir: Path = Path("runs/imitate")
     """Folder for the checkpoint."""
+    expert: Expert = "scripted"
+    """Who is imitated: a pusher without obstacles, or one that steers around all of them."""
+    method: str = "push"
+    """Whose LiDAR and map the networks see, if there are obstacles."""
+    simulator: Simulator = "bullet"
+    """Which simulator runs the worlds."""
+    encoder: Path | None = None
+    """Weights of the map's encoder, as ``pretrain-map`` writes them; none takes those that are shipped."""
     num_envs: int = 32
     """Worlds that are played side by side [1]."""
     rounds: int = 4
@@ -66,7 +86,7 @@ class ImitateConfig:
 
 
 def imitate(config: ImitateConfig) -> Path:
-    """Fit the actor to the scripted pusher.
+    """Fit the actor to the expert.
 
     Args:
         config: Amount of data and of fitting.
@@ -77,63 +97,67 @@ def imitate(config: ImitateConfig) -> Path:
     torch.manual_seed(config.seed)
     train_config = _train_config(config)
     networks = Networks(train_config)
-    env = make_env(train_config, config.num_envs)
-    observations, labels = torch.empty(0), torch.empty(0)
+    env = _make_env(train_config, config)
+    rounds: list[TensorDictBase] = []
     try:
         for index in range(config.rounds):
             with one_thread():
-                seen, expert = _collect(env, networks, config, learner_drives=index > 0)
-            observations, labels = torch.cat([observations, seen]), torch.cat([labels, expert])
-            networks.observation_norm.update(seen)
-            error = _fit(networks, observations, labels, config)
-            logger.info("round %d: %d frames, root mean square error of the action %.3f", index + 1, len(labels), error)
+                rounds.append(_collect(env, networks, config, learner_drives=index > 0))
+            networks.observation_norm.update(rounds[-1][keys.OBSERVATION])
+            data = torch.cat(rounds)
+            error = _fit(networks, data, config)
+            logger.info("round %d: %d frames, root mean square error of the action %.3f", index + 1, len(data), error)
     finally:
         env.close()
     folder = config.run_dir / CHECKPOINT_FOLDER
-    return save_checkpoint({"networks": networks}, train_config, folder, frames=len(labels))
+    return save_checkpoint({"networks": networks}, train_config, folder, frames=len(data))
 
 
 def _train_config(config: ImitateConfig) -> TrainConfig:
-    """Return the configuration of a policy that sees no map, where there are no obstacles."""
-    preset = method("push")
-    scenario = dataclasses.replace(preset.env.task.scenario, max_obstacles=0)
-    env = dataclasses.replace(
-        preset.env,
-        task=dataclasses.replace(preset.env.task, scenario=scenario),
-        lidar=dataclasses.replace(preset.env.lidar, num_rays=8),
-    )
-    return preset.replace(
-        env=env,
-        network=dataclasses.replace(preset.network, init_std=config.std),
-        perception="none",
+    """Return the configuration of the policy: one that sees no map if there are no obstacles."""
+    preset = method(config.method).replace(
         seed=config.seed,
         run_dir=config.run_dir,
         num_envs=config.num_envs,
+        simulator=config.simulator,
+        encoder=config.encoder,
     )
+    network = dataclasses.replace(preset.network, init_std=config.std)
+    task = dataclasses.replace(preset.env.task, curriculum=())
+    lidar, perception = preset.env.lidar, preset.perception
+    if config.expert == "scripted":
+        task = dataclasses.replace(task, scenario=dataclasses.replace(task.scenario, max_obstacles=0))
+        lidar, perception = dataclasses.replace(lidar, num_rays=8), "none"
+    env = dataclasses.replace(preset.env, task=task, lidar=lidar)
+    return preset.replace(network=network, env=env, perception=perception)
+
+
+def _make_env(train_config: TrainConfig, config: ImitateConfig) -> EnvBase:
+    """Return the worlds, which show the expert what it asks for."""
+    task = dataclasses.replace(train_config.env.task, privileged=config.expert == "avoider")
+    return make_env(train_config.replace(env=dataclasses.replace(train_config.env, task=task)), config.num_envs)
 
 
 @torch.no_grad()
-def _collect(
-    env: EnvBase, networks: Networks, config: ImitateConfig, *, learner_drives: bool
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return observations ``[F, D]`` and the expert's actions ``[F, A]``."""
-    expert = ScriptedPusher()
+def _collect(env: EnvBase, networks: Networks, config: ImitateConfig, *, learner_drives: bool) -> TensorDictBase:
+    """Return what the networks see and the expert's actions, batch size ``[F]``."""
+    expert = ScriptedAvoider() if config.expert == "avoider" else ScriptedPusher()
     is_learner = (torch.arange(config.num_envs) % 2 == 0)[:, None] & torch.tensor(learner_drives)
     carrier, noise, kept = env.reset(), torch.zeros(config.num_envs, 6), []
     for _ in tqdm(range(config.steps), desc="collect", unit="step"):
-        label = expert(carrier.select(keys.OBSERVATION))[keys.ACTION]
-        own = networks.actor.module[0](carrier.select(keys.OBSERVATION, keys.LATENT))["loc"]
-        kept.append((carrier[keys.OBSERVATION], label))
+        label = expert(carrier.select(*expert.in_keys))[keys.ACTION]
+        own = networks.actor.module[0](carrier.select(*_SEEN_KEYS))["loc"]
+        kept.append(carrier.select(*_SEEN_KEYS).set(keys.ACTION, label))
         # Ornstein-Uhlenbeck, correlated over about ten steps: white noise would average out.
         noise = 0.9 * noise + config.noise * (1 - 0.9**2) ** 0.5 * torch.randn_like(noise)
         _, carrier = env.step_and_maybe_reset(
             carrier.set(keys.ACTION, (torch.where(is_learner, own, label) + noise).clamp(-1.0, 1.0))
         )
-    return torch.cat([entry[0] for entry in kept]), torch.cat([entry[1] for entry in kept])
+    return torch.cat(kept)
 
 
-def _fit(networks: Networks, observations: torch.Tensor, labels: torch.Tensor, config: ImitateConfig) -> float:
-    """Regress the actor's mean on the labels.
+def _fit(networks: Networks, data: TensorDictBase, config: ImitateConfig) -> float:
+    """Regress the actor's mean on the expert's actions.
 
     Returns:
         Root mean square error of the last pass [1].
@@ -143,15 +167,13 @@ def _fit(networks: Networks, observations: torch.Tensor, labels: torch.Tensor, c
     error = 0.0
     for _ in tqdm(range(config.epochs), desc="fit", unit="epoch"):
         total = 0.0
-        for index in torch.randperm(len(labels)).split(config.minibatch_size):
-            batch = TensorDict(
-                {keys.OBSERVATION: observations[index], keys.LATENT: torch.zeros(len(index), LATENT_SIZE)}, [len(index)]
-            )
-            loss = (networks.actor.module[0](batch)["loc"] - labels[index]).square().mean()
+        for index in torch.randperm(len(data)).split(config.minibatch_size):
+            batch = data[index]
+            loss = (networks.actor.module[0](batch.select(*_SEEN_KEYS))["loc"] - batch[keys.ACTION]).square().mean()
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
             total += loss.item() * len(index)
         schedule.step()
-        error = (total / len(labels)) ** 0.5
+        error = (total / len(data)) ** 0.5
     return error

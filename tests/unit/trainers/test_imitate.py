@@ -1,17 +1,19 @@
-"""The warm start: it fits the script, ignores the map, and any method can go on from it."""
+"""The warm start: it fits the script, ignores the map unless it imitates the avoider, and training goes on from it."""
 
 from __future__ import annotations
 
 import logging
+from contextlib import closing
 
 import pytest
 import torch
 from tensordict import TensorDict
 
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE
+from cura_torchrl.envs.robots.scripted import ScriptedPusher
 from cura_torchrl.trainers.build import LATENT_SIZE, Networks
 from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, restore
-from cura_torchrl.trainers.imitate import ImitateConfig, imitate
+from cura_torchrl.trainers.imitate import ImitateConfig, _collect, _make_env, _train_config, imitate
 from cura_torchrl.trainers.methods import method
 
 
@@ -44,6 +46,50 @@ def test_networks_of_any_method_start_from_it_and_ignore_the_map_at_first(checkp
         "scale"
     ]
     torch.testing.assert_close(scale, torch.full((5, 6), 0.2))
+
+
+@pytest.fixture(scope="module")
+def avoiding(tmp_path_factory):
+    """A checkpoint that imitates the avoider with what ``cura-ppo`` sees."""
+    folder = tmp_path_factory.mktemp("avoid")
+    sizes = {"num_envs": 4, "rounds": 2, "steps": 10, "epochs": 5, "minibatch_size": 16}
+    return imitate(ImitateConfig(run_dir=folder, expert="avoider", method="cura-ppo", simulator="planar", **sizes))
+
+
+def test_who_imitates_the_avoider_sees_what_its_method_sees_and_nothing_more(avoiding):
+    """Catches another method's LiDAR or map, and true obstacles that leak from the expert into the policy's worlds."""
+    config, record = read_config(find_checkpoint(avoiding))
+    expected = method("cura-ppo").replace(simulator="planar")
+    assert (config.method, config.simulator, config.perception) == ("cura-ppo", "planar", "map")
+    assert (config.map, config.env.lidar) == (expected.map, expected.env.lidar)
+    assert config.env.task.scenario == expected.env.task.scenario
+    assert config.env.task.curriculum == ()
+    assert not config.env.task.privileged
+    assert record["frames"] == 80
+
+
+def test_who_imitates_the_avoider_reads_the_map(avoiding):
+    """Catches a fit to the vector alone, which cannot know where to steer."""
+    networks = Networks(method("cura-ppo"))
+    restore(find_checkpoint(avoiding), {"networks": networks})
+    seen = torch.randn(1, OBSERVATION_SIZE).expand(2, -1)
+    codes = torch.stack([torch.zeros(LATENT_SIZE), torch.ones(LATENT_SIZE)])
+    blank, full = networks.actor.module[0](TensorDict({"observation": seen, "latent": codes}, [2]))["loc"]
+    assert not torch.equal(blank, full)
+
+
+def test_the_avoiders_actions_are_what_is_learned():
+    """Catches labels of the pusher that sees no obstacles: near an obstacle the two differ."""
+    config = ImitateConfig(expert="avoider", method="push", simulator="planar", num_envs=8, steps=60, noise=0.0)
+    kept = _one_round(config)
+    blind = ScriptedPusher()(kept.select("observation").clone())["action"]
+    assert (kept["action"] - blind).abs().amax() > 0.2
+
+
+def _one_round(config):
+    train_config = _train_config(config)
+    with closing(_make_env(train_config, config)) as env:
+        return _collect(env, Networks(train_config), config, learner_drives=False)
 
 
 def test_fitting_reduces_the_error_of_the_action(tmp_path, caplog):

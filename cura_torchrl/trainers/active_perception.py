@@ -1,0 +1,177 @@
+"""How much a policy looks: what is seen ahead of the object, how soon obstacles are, how far the base moves aside."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from cura_torchrl import keys
+from cura_torchrl.envs import geometry
+from cura_torchrl.envs.config import MapConfig
+from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
+from cura_torchrl.envs.sensors.lidar import ray_angles
+from cura_torchrl.envs.transforms import ConfidenceMap
+
+if TYPE_CHECKING:
+    from tensordict import TensorDictBase
+    from torchrl.envs import TransformedEnv
+
+    from cura_torchrl.envs.config import LidarConfig
+
+SIGHT_MAP = "sight_map"
+"""Key of the map that looking is measured by: that of alpha = 0.9, whatever the policy's own map is."""
+_MAP = MapConfig(decay=0.9)
+MOVING = 0.2
+"""Speed above which the object counts as moving [m/s]."""
+AHEAD = 2.5
+"""How far past the object's face the area ahead of it reaches [m]."""
+MARGIN = 0.3
+"""How much wider than the object, on either side, the area ahead of it is [m]."""
+_HIT = 0.06
+"""How far from an obstacle's outline a ray that hit it may end [m]: six deviations of the LiDAR's noise."""
+
+
+def sight_map(lidar: LidarConfig) -> ConfidenceMap:
+    """Return the transform that :class:`LookingMeter` needs, to append to an environment.
+
+    Args:
+        lidar: The environment's LiDAR.
+
+    Returns:
+        Map of the paper's alpha = 0.9 under :data:`SIGHT_MAP`: comparable between methods whose own maps differ.
+    """
+    return ConfidenceMap(_MAP, num_rays=lidar.num_rays, max_range=lidar.max_range, out_key=SIGHT_MAP)
+
+
+def unseen_ahead(
+    maps: torch.Tensor, centre: torch.Tensor, half: torch.Tensor, ahead: torch.Tensor, resolution: float
+) -> torch.Tensor:
+    """Return the mean of 1 - M over the area ahead of the object.
+
+    Args:
+        maps: Windows of the map, shape ``[N, C, W, W]``; the first channel is the confidence M.
+        centre: Object's centre, base frame [m], shape ``[N, 2]``.
+        half: Half its edge [m], shape ``[N, 1]``.
+        ahead: Unit vector to where it goes, base frame [1], shape ``[N, 2]``.
+        resolution: Edge of a cell [m].
+
+    Returns:
+        What has not been seen lately of the :data:`AHEAD` metres past its face, :data:`MARGIN` wider than it is, 0 to 1
+        [1], shape ``[N]``.
+
+    Examples:
+        >>> seen = torch.ones(1, 2, 100, 100)
+        >>> unseen_ahead(seen, torch.tensor([[1.0, 0.0]]), torch.tensor([[0.5]]), torch.tensor([[1.0, 0.0]]), 0.1)
+        tensor([0.])
+    """
+    left = torch.stack([-ahead[:, 1], ahead[:, 0]], dim=-1)
+    along = torch.linspace(0.05, AHEAD, 25)[None, :, None, None]
+    across = torch.linspace(-1.0, 1.0, 13)[None, None, :, None] * (half + MARGIN)[:, None, None]
+    points = centre[:, None, None] + (half[:, None, None] + along) * ahead[:, None, None] + across * left[:, None, None]
+    size = maps.shape[-1]
+    cell = (points / resolution + size / 2).long().clamp(0, size - 1)
+    rows = torch.arange(len(maps))[:, None, None]
+    return 1.0 - maps[rows, 0, cell[..., 0], cell[..., 1]].mean((1, 2))
+
+
+def obstacles_hit(
+    scan: torch.Tensor, sensor_pose: torch.Tensor, obstacles: torch.Tensor, max_range: float
+) -> torch.Tensor:
+    """Tell which obstacles a scan has hit.
+
+    Args:
+        scan: Ranges [m], shape ``[N, R]``.
+        sensor_pose: Sensor (x [m], y [m], yaw [rad]), world frame, shape ``[N, 3]``.
+        obstacles: As under :data:`cura_torchrl.keys.OBSTACLES`, shape ``[N, M, 4]``.
+        max_range: What a miss reads [m].
+
+    Returns:
+        Whether a ray ends on the obstacle, bool, shape ``[N, M]``.
+    """
+    angle = ray_angles(scan.shape[-1]).float() + sensor_pose[:, 2:]
+    ends = sensor_pose[:, None, :2] + scan[..., None] * torch.stack([angle.cos(), angle.sin()], dim=-1)
+    ends = ends[:, None].expand(-1, obstacles.shape[1], -1, -1)
+    local = geometry.to_frame(obstacles[:, :, None, :3].expand(*ends.shape[:-1], 3), ends).abs()
+    off = (local - obstacles[:, :, None, 3:] / 2).clamp_min(0.0).amax(-1)
+    hit = (off < _HIT) & (scan < max_range - _HIT)[:, None]
+    return hit.any(-1) & (obstacles[..., 3] > 0)
+
+
+class LookingMeter:
+    """Measure how much is looked while episodes are played, as the ``watch`` of :func:`~.evaluate.play_episodes`.
+
+    Args:
+        env: Environment with ``TaskConfig.privileged``; a map is appended to it.
+        lidar: Its LiDAR.
+        period: Time of a policy step [s].
+    """
+
+    def __init__(self, env: TransformedEnv, lidar: LidarConfig, period: float) -> None:
+        env.append_transform(sight_map(lidar))
+        self._lidar, self._period = lidar, period
+        self._beside: list[torch.Tensor] = []
+        self._unseen: list[torch.Tensor] = []
+        self._speed: list[torch.Tensor] = []
+        self._waits: list[torch.Tensor] = []
+        self._distances: list[torch.Tensor] = []
+        self._episode = torch.empty(0)
+        self._appeared = torch.empty(0)
+        self._is_known = torch.empty(0, dtype=torch.bool)
+
+    def watch(self, state: TensorDictBase, playing: torch.Tensor) -> None:
+        """Note what a state says.
+
+        Args:
+            state: What the environment emits, batch size ``[N]``.
+            playing: Rows that count, bool, shape ``[N]``.
+        """
+        parts = {name: state[keys.OBSERVATION][:, part] for name, part in OBSERVATION_SLICES.items()}
+        centre, velocity = parts["object_position"][:, :2], parts["object_velocity"]
+        speed = geometry.norm(velocity)
+        moves = playing & (speed > MOVING)
+        ahead = velocity / speed.clamp_min(1e-6)[:, None]
+        self._speed.append(speed[playing])
+        self._beside.append((ahead[:, 0] * centre[:, 1] - ahead[:, 1] * centre[:, 0]).abs()[moves])
+        half = parts["object_position"][:, 2:]
+        moving = (state[SIGHT_MAP][moves], centre[moves], half[moves], ahead[moves])
+        self._unseen.append(unseen_ahead(*moving, _MAP.resolution))
+        self._note_sightings(state, playing)
+
+    def _note_sightings(self, state: TensorDictBase, playing: torch.Tensor) -> None:
+        obstacles, elapsed = state[keys.OBSTACLES], state[keys.ELAPSED_STEPS].float()
+        episode = state[keys.EPISODE]
+        if len(self._episode) != len(episode):
+            self._episode = torch.full_like(episode, -1)
+            self._appeared = torch.full_like(obstacles[..., 0], torch.nan)
+            self._is_known = torch.zeros_like(self._appeared, dtype=torch.bool)
+        fresh = (episode != self._episode).expand_as(self._appeared)
+        self._episode = episode.clone()
+        self._appeared = self._appeared.masked_fill(fresh, torch.nan)
+        self._is_known = self._is_known & ~fresh
+        is_new = (obstacles[..., 3] > 0) & self._appeared.isnan()
+        self._appeared = torch.where(is_new, elapsed.expand_as(self._appeared), self._appeared)
+        hit = obstacles_hit(state[keys.SCAN], state[keys.SENSOR_POSE], obstacles, self._lidar.max_range)
+        first = hit & ~self._is_known & playing[:, None]
+        self._waits.append((self._period * (elapsed - self._appeared))[first])
+        away = geometry.norm(obstacles[..., :2] - state[keys.OBJECT_POSE][:, None, :2])
+        self._distances.append(away[first])
+        self._is_known = self._is_known | hit
+
+    def summary(self) -> dict[str, float]:
+        """Return the measures.
+
+        Returns:
+            ``object_speed`` [m/s]; while the object moves, how far the base is beside its way, median and 90 % quantile
+            [m], and the mean unseen share of the area ahead [1]; time from an obstacle's appearance to the first ray
+            that hits it, mean [s], and the object's distance from it then, mean [m].
+        """
+        beside, waits = torch.cat(self._beside), torch.cat(self._waits)
+        return {
+            "object_speed": torch.cat(self._speed).mean().item(),
+            "beside_median_m": beside.quantile(0.5).item(),
+            "beside_q90_m": beside.quantile(0.9).item(),
+            "unseen_ahead": torch.cat(self._unseen).mean().item(),
+            "first_seen_s": waits.mean().item(),
+            "first_seen_m": torch.cat(self._distances).mean().item(),
+        }
