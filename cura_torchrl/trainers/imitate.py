@@ -28,6 +28,7 @@ from cura_torchrl.envs.config import Simulator, require, require_finite
 from cura_torchrl.envs.robots.scripted import ScriptedAvoider, ScriptedPusher
 from cura_torchrl.trainers.build import Networks, make_env
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
+from cura_torchrl.trainers.config import Perception
 from cura_torchrl.trainers.methods import method
 from cura_torchrl.trainers.threads import one_thread
 
@@ -55,6 +56,8 @@ class ImitateConfig:
     """Who is imitated: a pusher without obstacles, or one that steers around all of them."""
     method: str = "push"
     """Whose LiDAR and map the networks see, if there are obstacles."""
+    perception: Perception = "map"
+    """What they see beside their vector, if there are obstacles: the map's code, or the true obstacles for diagnosis."""
     simulator: Simulator = "bullet"
     """Which simulator runs the worlds."""
     encoder: Path | None = None
@@ -124,7 +127,7 @@ def _train_config(config: ImitateConfig) -> TrainConfig:
     )
     network = dataclasses.replace(preset.network, init_std=config.std)
     task = dataclasses.replace(preset.env.task, curriculum=())
-    lidar, perception = preset.env.lidar, preset.perception
+    lidar, perception = preset.env.lidar, config.perception
     if config.expert == "scripted":
         task = dataclasses.replace(task, scenario=dataclasses.replace(task.scenario, max_obstacles=0))
         lidar, perception = dataclasses.replace(lidar, num_rays=8), "none"
