@@ -57,7 +57,7 @@ class ImitateConfig:
     method: str = "push"
     """Whose LiDAR and map the networks see, if there are obstacles."""
     perception: Perception = "map"
-    """What they see beside their vector, if there are obstacles: the map's code, or the true obstacles for diagnosis."""
+    """What they see beside their vector, if there are obstacles: the map's code, or for diagnosis the obstacles."""
     simulator: Simulator = "bullet"
     """Which simulator runs the worlds."""
     encoder: Path | None = None
