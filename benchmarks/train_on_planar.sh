@@ -3,8 +3,8 @@
 # method sees. Run it again after an interruption, or with more frames: each run goes on from where it was.
 #   benchmarks/train_on_planar.sh RUNS FRAMES METHOD... [-- FLAG...]
 # FLAG... is handed to `cura-torchrl train`. ENCODER=<file> takes another encoder than the one that is shipped, SEED=<n> another seed,
-# NAME=<folder> another name than METHOD-SEED. benchmarks/training/map_vae.pt is the encoder of both simulators' maps that the
-# experiments in docs/research were run with.
+# NAME=<folder> another name than METHOD-SEED, START=<run> another start, WORKERS=<n> processes. benchmarks/training/map_vae.pt is the
+# encoder of both simulators' maps that the experiments in docs/research were run with.
 set -euo pipefail
 runs=$1 frames=$2
 shift 2
@@ -24,7 +24,7 @@ for method in "${methods[@]}"; do
     push | push-no-occlusion) sees=$method ;;
     *) sees=push-conf ;;
   esac
-  start=$runs/imitate-$sees run=$runs/${NAME:-$method-$seed}
+  start=${START:-$runs/imitate-$sees} run=$runs/${NAME:-$method-$seed}
   if [ ! -d "$start/checkpoints" ]; then
     cura-torchrl imitate --run-dir "$start" --expert avoider --method "$sees" --simulator planar "${encoder[@]}" --num-envs 1024 \
       --rounds 6 --steps 150 --epochs 10 --minibatch-size 2048
@@ -32,7 +32,7 @@ for method in "${methods[@]}"; do
   if [ -d "$run/checkpoints" ]; then
     cura-torchrl train --run-dir "$run" --total-frames "$frames" --resume
   else
-    cura-torchrl train --method "$method" --simulator planar --num-envs 1024 --num-workers 2 --total-frames "$frames" --seed "$seed" \
+    cura-torchrl train --method "$method" --simulator planar --num-envs 1024 --num-workers "${WORKERS:-2}" --total-frames "$frames" --seed "$seed" \
       --run-dir "$run" --init-from "$start" "${encoder[@]}" --ppo.rollout-steps 24 --ppo.minibatch-size 6144 --ppo.lr 3e-4 \
       --ppo.critic-warmup-frames 250000 --cura.costs-start-frames 250000 --ppo.entropy-coeff 0.001 --ppo.target-kl 0.02 \
       --network.min-std 0.15 --env.task.curriculum 0 6 "$@"

@@ -58,6 +58,8 @@ SHAPE = RobotShape(
     hand_size=(0.12, 0.122),
     hand_front=(0.0074, 0.0105),
     arm_half_width=0.1,
+    joint_lower=JOINT_LOWER,
+    joint_upper=JOINT_UPPER,
 )
 """The robot seen from above. The chassis' box in the URDF spans 0.056 to 0.306 m above the ground; the hand is as wide
 as its two open fingers, whose tips are 21 mm thick and end 7.4 mm beyond the TCP."""

@@ -70,6 +70,10 @@ class RobotShape:
     """How far the fingertips reach beyond the TCP, along the hand's axis and across it, in the vertical plane [m]."""
     arm_half_width: float
     """Half the width of the arm between chassis and TCP [m]."""
+    joint_lower: tuple[float, ...]
+    """Lower stop of each joint of the arm [rad]."""
+    joint_upper: tuple[float, ...]
+    """Upper stops [rad]."""
 
 
 @dataclass(frozen=True)

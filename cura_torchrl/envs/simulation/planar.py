@@ -60,6 +60,8 @@ class PlanarWorlds:
         self._cube = Cube(zeros(3), zeros(3), zeros() + 1.0, zeros() + 1.0, zeros() + 1.0, zeros(3))
         self._pushing = PushContact(num_worlds, 2, physics, device)
         self._half = torch.tensor([shape.hand_size, shape.chassis_size], dtype=torch.float64, device=device) / 2
+        stops = torch.tensor([shape.joint_lower, shape.joint_upper], dtype=torch.float64, device=device)
+        self._lower, self._upper = stops[..., None]
         self._obstacle_pose, self._obstacle_edge = zeros(0, 3), zeros(0)
         self._contact = torch.zeros(num_worlds, 3, dtype=torch.bool, device=device)
         self._jacobian = zeros(2, 4, 10)
@@ -162,9 +164,20 @@ class PlanarWorlds:
         free = self._velocity + self._period * (self._inverse_inertia @ torque[..., None])[..., 0]
         impulse = self._pushing.solve(self._cube, self._pushers(free))
         recoil = self._flat_jacobian.mT @ impulse.permute(2, 1, 0).reshape(len(free), -1, 1)
-        self._velocity = free + (self._inverse_inertia @ recoil)[..., 0]
+        self._velocity = self._stopped(free + (self._inverse_inertia @ recoil)[..., 0])
         self._position = self._position + self._period * self._velocity
         self._cube.pose = self._cube.pose + self._period * self._cube.twist
+
+    def _stopped(self, velocity: torch.Tensor) -> torch.Tensor:
+        """Return joint velocities that lead no joint of the arm past its stops, by one impulse after the other."""
+        position = self._position.T
+        answers = self._inverse_inertia.permute(2, 1, 0)
+        velocity = velocity.T
+        for joint, (lower, upper) in enumerate(zip(self._lower, self._upper, strict=True), start=len(position) - 7):
+            own, least = velocity[joint], (lower - position[joint]) / self._period
+            allowed = torch.minimum(torch.maximum(own, least), (upper - position[joint]) / self._period)
+            velocity = velocity + answers[joint] * ((allowed - own) / answers[joint, joint])
+        return velocity.T.contiguous()
 
     def _hand_pose(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the TCP in the world [m] ``[N, 3]``, and the yaw of the hand's axis in the world [rad] ``[N]``."""
