@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from cura_torchrl.envs.simulation.interface import RobotShape, SceneState, TorqueLaw
 
 
+_ARM = slice(3, 10)
+"""The arm's joints; the base's come first."""
+
+
 class Dynamics(Protocol):
     """What knows the robot's inertia; see :class:`cura_torchrl.envs.robots.dynamics.RobotDynamics`."""
 
@@ -166,6 +170,8 @@ class PlanarWorlds:
         recoil = self._flat_jacobian.mT @ impulse.permute(2, 1, 0).reshape(len(free), -1, 1)
         self._velocity = self._stopped(free + (self._inverse_inertia @ recoil)[..., 0])
         self._position = self._position + self._period * self._velocity
+        # One pass over the stops leaves a residue where joints hit several at once: it must not add up.
+        self._position[:, _ARM].clamp_(self._lower[:, 0], self._upper[:, 0])
         self._cube.pose = self._cube.pose + self._period * self._cube.twist
 
     def _stopped(self, velocity: torch.Tensor) -> torch.Tensor:
@@ -173,7 +179,7 @@ class PlanarWorlds:
         position = self._position.T
         answers = self._inverse_inertia.permute(2, 1, 0)
         velocity = velocity.T
-        for joint, (lower, upper) in enumerate(zip(self._lower, self._upper, strict=True), start=len(position) - 7):
+        for joint, (lower, upper) in enumerate(zip(self._lower, self._upper, strict=True), start=_ARM.start):
             own, least = velocity[joint], (lower - position[joint]) / self._period
             allowed = torch.minimum(torch.maximum(own, least), (upper - position[joint]) / self._period)
             velocity = velocity + answers[joint] * ((allowed - own) / answers[joint, joint])
