@@ -1,6 +1,6 @@
-"""Does it stay brave, and does it look? Plays frozen scenes with trained runs and compares outcomes and looking.
+"""How trained runs end episodes, and how much they look, side by side on the same scenes of the planar simulator.
 
-python benchmarks/research/bravery.py letter=runs/cura-ppo-0 none=runs/push-conf-0 --output runs/research/bravery.json
+python benchmarks/research/compare_runs.py none=runs/none letter=runs/letter --output runs/research/bravery.json
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def main() -> None:
     parser.add_argument("--envs", type=int, default=100, help="worlds side by side")
     parser.add_argument("--seed", type=int, default=2000, help="seed of the scenes; never 0, the evaluation's")
     parser.add_argument("--max-obstacles", type=int, default=6, help="most obstacles K in an episode")
-    parser.add_argument("--output", type=Path, default=Path("runs/research/bravery.json"), help="result file")
+    parser.add_argument("--output", type=Path, default=Path("runs/research/compare_runs.json"), help="result file")
     options = parser.parse_args()
     results: dict[str, Any] = {}
     for name, folder in (entry.split("=", 1) for entry in options.runs):
