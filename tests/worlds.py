@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 
 from cura_torchrl.envs.config import PhysicsConfig, RobotConfig
@@ -14,6 +13,8 @@ from cura_torchrl.envs.simulation.bullet import BulletWorlds
 from cura_torchrl.envs.simulation.interface import SceneState
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from cura_torchrl.envs.simulation.interface import TorqueLaw, Worlds, WorldState
 
 TICKS = 40
@@ -72,31 +73,31 @@ class NoTorque:
 
     ik_ticks = TICKS
 
-    def solve_ik(self) -> None:
+    def solve_ik_of(self, world: int) -> None:
         """Plan nothing."""
 
-    def torques(self, rows: slice, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    def torques_of(self, world: int, joints: np.ndarray) -> list[float]:
         """Return zeros."""
-        return np.zeros_like(position)
+        return [0.0] * joints.shape[1]
 
 
 class Recorder:
-    """A law that passes another one on and keeps what it saw and said, tick by tick."""
+    """A law that passes another one on and keeps what each world saw and was told, tick by tick."""
 
-    def __init__(self, law: TorqueLaw) -> None:
+    def __init__(self, law: TorqueLaw, num_worlds: int) -> None:
         self.law, self.ik_ticks = law, law.ik_ticks
-        self.velocity: list[np.ndarray] = []
-        self.torque: list[np.ndarray] = []
+        self.velocity: list[list[np.ndarray]] = [[] for _ in range(num_worlds)]
+        self.torque: list[list[list[float]]] = [[] for _ in range(num_worlds)]
 
-    def solve_ik(self) -> None:
+    def solve_ik_of(self, world: int) -> None:
         """Plan."""
-        self.law.solve_ik()
+        self.law.solve_ik_of(world)
 
-    def torques(self, rows: slice, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    def torques_of(self, world: int, joints: np.ndarray) -> list[float]:
         """Return the law's torques."""
-        torque = self.law.torques(rows, position, velocity)
-        self.velocity.append(velocity.copy())
-        self.torque.append(torque.copy())
+        torque = self.law.torques_of(world, joints)
+        self.velocity[world].append(joints[1].copy())
+        self.torque[world].append(torque)
         return torque
 
 
@@ -109,7 +110,7 @@ class Rig:
         self.controller = ImpedanceController(num_worlds, RobotConfig(), PhysicsConfig().control_period)
         limit = torch.full((num_worlds,), height_limit, dtype=torch.float64)
         self.controller.reset(torch.arange(num_worlds), limit)
-        self.record = Recorder(self.controller)
+        self.record = Recorder(self.controller, num_worlds)
 
     @property
     def state(self) -> WorldState:

@@ -90,15 +90,14 @@ class Episode:
         """Keep the torques, rays and obstacles of each policy step, then the object's positions in every tick."""
         env: Any = self._env
         worlds, law = env._worlds, env._controller
-        torques: dict[int, list[np.ndarray]] = {}
+        torques: list[list[list[float]]] = [[] for _ in range(env.num_envs)]
         self._rays: list[tuple[np.ndarray, np.ndarray]] = []
         self._obstacles: list[list[tuple[torch.Tensor, ...]]] = []
-        compute, cast, place = law.torques, env._lidar._cast, worlds.place_obstacles
+        compute, cast, place = law.torques_of, env._lidar._cast, worlds.place_obstacles
 
-        def keep_torques(rows: slice, *state: np.ndarray) -> np.ndarray:
-            result: np.ndarray = compute(rows, *state)
-            torques.setdefault(rows.start, []).append(result.copy())
-            return result
+        def keep_torques(world: int, joints: np.ndarray) -> list[float]:
+            torques[world].append(compute(world, joints))
+            return torques[world][-1]
 
         def keep_rays(rows: torch.Tensor, origin: torch.Tensor, ends: torch.Tensor, **options: bool) -> torch.Tensor:
             starts = origin[:, None].expand(ends.shape).contiguous().numpy()
@@ -111,17 +110,17 @@ class Episode:
             place(*new)
 
         data = self.reset()
-        env._lidar._cast, law.torques, worlds.place_obstacles = keep_rays, keep_torques, keep_obstacles
+        env._lidar._cast, law.torques_of, worlds.place_obstacles = keep_rays, keep_torques, keep_obstacles
         self._obstacles.append([])
         for action in self._actions:
             data = env.step(data.set(keys.ACTION, action))["next"]
         env._lidar._cast = cast
-        del law.torques, worlds.place_obstacles
-        blocks = [np.stack(torques[first], axis=1) for first in sorted(torques)]
-        steps = np.split(np.concatenate(blocks), len(self._actions), axis=1)
-        self._torques: list[list[list[list[float]]]] = [step.tolist() for step in steps]
+        del law.torques_of, worlds.place_obstacles
+        ticks = len(torques[0]) // len(self._actions)
+        starts = range(0, len(torques[0]), ticks)
+        self._torques = [[ours[start : start + ticks] for ours in torques] for start in starts]
         self._end: np.ndarray = worlds._joint_state.copy()
-        self._positions: list[Any] = [None] * len(steps)
+        self._positions: list[Any] = [None] * len(self._torques)
         self.play_bare()
 
     def play_bare(self) -> float:

@@ -8,9 +8,7 @@ from xml.etree import ElementTree
 import pytorch_kinematics as pk
 import torch
 
-from cura_torchrl.envs.robots.ridgeback_franka import ARM_JOINTS, BASE_LINK, TCP_LINK, URDF
-
-_ARM_LINKS = tuple(name.replace("joint", "link") for name in ARM_JOINTS)
+from cura_torchrl.envs.robots.ridgeback_franka import ARM_LINKS, BASE_LINK, TCP_LINK, URDF
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ class RobotDynamics:
             columns = ([part.mass for part in parts], [part.moment for part in parts], [part.tensor for part in parts])
             return _Inertia(*(torch.stack(column).to(device) for column in columns))
 
-        self._arm, self._base = stack(_ARM_LINKS), stack((BASE_LINK,))
+        self._arm, self._base = stack(ARM_LINKS), stack((BASE_LINK,))
         slides = [masses[name].mass.item() for name in ("base_slide_x", "base_slide_y")]
         self._slides = torch.tensor([sum(slides), slides[1]], dtype=torch.float64, device=device)
         # Twists (angular, linear at the base's origin) of the base's x, y and yaw, in the base frame.
@@ -83,7 +81,7 @@ class RobotDynamics:
             in one frame.
         """
         poses = self._chain.forward_kinematics(joint_position[:, 3:], end_only=False)
-        frames = torch.stack([poses[link].get_matrix() for link in _ARM_LINKS], dim=1)
+        frames = torch.stack([poses[link].get_matrix() for link in ARM_LINKS], dim=1)
         rotation, position = frames[..., :3, :3], frames[..., :3, 3]
         bodies = self._arm.moved(rotation, position)
         # What each joint carries: all links from its own to the hand; the base's joints carry those and the base.

@@ -1,11 +1,16 @@
-"""Forward kinematics, Jacobian and damped least squares of the arm, batched over worlds (pytorch-kinematics)."""
+"""Forward kinematics, Jacobian and damped least squares of the arm, batched over worlds.
+
+The chain is pytorch-kinematics'. Its tensor operations take longer to start than to do on the CPU: there the same is
+compiled.
+"""
 
 from __future__ import annotations
 
 import pytorch_kinematics as pk
 import torch
 
-from cura_torchrl.envs.robots.ridgeback_franka import BASE_LINK, BASE_LINK_HEIGHT, TCP_LINK, URDF
+from cura_torchrl.envs.robots.ik_kernel import place_hands
+from cura_torchrl.envs.robots.ridgeback_franka import ARM_LINKS, BASE_LINK, BASE_LINK_HEIGHT, TCP_LINK, URDF
 
 
 class ArmKinematics:
@@ -13,6 +18,10 @@ class ArmKinematics:
 
     Args:
         device: Where the tensors live; the CPU when None.
+
+    Attributes:
+        offsets: Rotation and position [m] of each joint at zero in the frame of the one before it, of the first in the
+            base frame, of the TCP in that of the last; on the CPU, shape ``[8, 3, 4]``. Joints turn about their z axis.
 
     Examples:
         >>> arm = ArmKinematics()
@@ -24,6 +33,11 @@ class ArmKinematics:
     def __init__(self, device: torch.device | None = None) -> None:
         chain = pk.build_serial_chain_from_urdf(URDF.read_bytes(), TCP_LINK, root_link_name=BASE_LINK)
         self._chain = chain.to(dtype=torch.float64, device=device)
+        poses = self._chain.forward_kinematics(self._chain.axes.new_zeros(1, 7), end_only=False)
+        frames = torch.cat([poses[link].get_matrix() for link in (*ARM_LINKS, TCP_LINK)]).cpu()
+        frames[:, 2, 3] += BASE_LINK_HEIGHT
+        frames[1:] = torch.linalg.solve(frames[:-1], frames[1:])
+        self.offsets = frames[:, :3].contiguous()
 
     def forward(self, joint_position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return where the TCP is and how it moves with the joints.
@@ -35,6 +49,11 @@ class ArmKinematics:
             TCP position [m], shape ``[N, 3]``; its rotation matrix, shape ``[N, 3, 3]``; the Jacobian of linear, then
             angular velocity [m/rad, 1], shape ``[N, 6, 7]``; all in the base frame.
         """
+        if joint_position.device.type == "cpu":
+            rows = len(joint_position)
+            pose, jacobian = joint_position.new_empty(rows, 3, 4), joint_position.new_empty(rows, 6, 7)
+            place_hands(joint_position.contiguous().numpy(), pose.numpy(), jacobian.numpy(), self.offsets.numpy())
+            return pose[:, :, 3], pose[:, :, :3], jacobian
         jacobian, pose = self._chain.jacobian(joint_position, ret_eef_pose=True)
         position = pose[:, :3, 3].clone()
         position[:, 2] += BASE_LINK_HEIGHT

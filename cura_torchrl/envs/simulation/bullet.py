@@ -1,4 +1,4 @@
-"""PyBullet: N worlds, one client each, stepped in lockstep. The only file that knows the engine.
+"""PyBullet: N worlds, one client each, stepped one after the other. The only file that knows the engine.
 
 World gravity is zero: a gravity-compensated arm then needs no inverse dynamics, and the object's weight is an external
 force on its centre of mass in every tick. A reset rebuilds the world from nothing, so an episode cannot depend on
@@ -10,6 +10,8 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+from operator import itemgetter
+from struct import Struct
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,14 +33,11 @@ _RAY_GROUP = 1
 _MAX_RAYS = 8192
 """Rays in one call; Bullet returns nothing for 16,384 numpy rays or more."""
 
-_BLOCK = 16
-"""Worlds stepped together between two IK solutions.
-
-A compromise: with more of them numpy's overhead is shared, and each one's data have left the cache when its turn comes.
-"""
-
 _BASE_LINKS = ("base_slide_x", "base_slide_y", "base_link")
 """The robot's first links; all later ones belong to the arm."""
+
+_position, _velocity = itemgetter(0), itemgetter(1)
+"""What is wanted of Bullet's answer for a joint."""
 
 
 class BulletWorlds:
@@ -180,14 +179,13 @@ class BulletWorlds:
         bullet.setCollisionFilterGroupMask(body, -1, OBSTACLE, _RAY_GROUP | ROBOT | OBJECT, physicsClientId=client)
         self._obstacles[world][slot] = body
 
-    def mass_matrix(self) -> np.ndarray:
+    def mass_matrix(self) -> torch.Tensor:
         """Return the joint-space inertia of every robot [kg, kg m^2], shape ``[N, J, J]``."""
-        return np.array(
-            [
-                bullet.calculateMassMatrix(robot, state[0].tolist(), physicsClientId=client)
-                for robot, state, client in zip(self._robot, self._joint_state, self._clients, strict=True)
-            ]
-        )
+        matrices = [
+            bullet.calculateMassMatrix(robot, state[0].tolist(), physicsClientId=client)
+            for robot, state, client in zip(self._robot, self._joint_state, self._clients, strict=True)
+        ]
+        return torch.from_numpy(np.array(matrices))
 
     def advance(self, law: TorqueLaw, ticks: int) -> None:
         """Run control and physics of one policy step.
@@ -200,51 +198,44 @@ class BulletWorlds:
             SimulationError: If a state or a torque is not finite.
         """
         self._contact[:] = False
-        for start in range(0, ticks, law.ik_ticks):
-            law.solve_ik()
-            for first in range(0, self.num_worlds, _BLOCK):
-                rows = slice(first, min(first + _BLOCK, self.num_worlds))
-                self._advance_block(law, rows, min(law.ik_ticks, ticks - start))
-            self._note_contacts()
+        for world in range(self.num_worlds):
+            self._play(law, world, ticks)
         state = self._joint_state
         finite = np.isfinite(state).all(axis=(1, 2))
         if not finite.all():
             msg = f"worlds {np.flatnonzero(~finite).tolist()} have joint states that are not finite"
             raise SimulationError(msg)
 
-    def _advance_block(self, law: TorqueLaw, rows: slice, ticks: int) -> None:
-        state, index = self._joint_state[rows], self._index
-        position, velocity, flat = state[:, 0], state[:, 1], state.reshape(-1)
-        # Looked up once, and client numbers by position: calls of half a microsecond are what the loop is made of.
+    def _play(self, law: TorqueLaw, world: int, ticks: int) -> None:
+        # All ticks of one world in a row: its data stay in the cache. What can be is passed by position, and what is
+        # looked up is looked up once: calls of half a microsecond are what the loop is made of.
+        client, robot, body = self._clients[world], self._robot[world], self._object[world]
+        weight, joints, index = (0.0, 0.0, -self._weight[world].item()), self._joint_state[world], self._index
         command, push, step = bullet.setJointMotorControlArray, bullet.applyExternalForce, bullet.stepSimulation
         read, locate = bullet.getJointStates, bullet.getBasePositionAndOrientation
         torque_control, world_frame = bullet.TORQUE_CONTROL, bullet.WORLD_FRAME
-        weights = [(0.0, 0.0, -weight) for weight in self._weight[rows].tolist()]
-        worlds = list(zip(self._clients[rows], self._robot[rows], self._object[rows], weights, strict=True))
-        for _ in range(ticks):
-            torques = law.torques(rows, position, velocity).tolist()
-            values: list[float] = []
-            for (client, robot, body, weight), torque in zip(worlds, torques, strict=True):
-                command(robot, index, torque_control, forces=torque, physicsClientId=client)
+        torques_of, keep = law.torques_of, Struct(f"{joints.size}d").pack_into
+        for start in range(0, ticks, law.ik_ticks):
+            law.solve_ik_of(world)
+            for _ in range(min(law.ik_ticks, ticks - start)):
+                command(robot, index, torque_control, forces=torques_of(world, joints), physicsClientId=client)
                 push(body, -1, weight, locate(body, client)[0], world_frame, client)
                 step(client)
-                positions, velocities, _, _ = zip(*read(robot, index, client), strict=True)
-                values += positions
-                values += velocities
-            flat[:] = values
+                entries = read(robot, index, client)
+                keep(joints, 0, *map(_position, entries), *map(_velocity, entries))
+            self._note_contacts(world)
 
-    def _note_contacts(self) -> None:
-        for world, slots in enumerate(self._obstacles):
-            for obstacle in slots:
-                if obstacle < 0:
+    def _note_contacts(self, world: int) -> None:
+        for obstacle in self._obstacles[world]:
+            if obstacle < 0:
+                continue
+            for point in bullet.getContactPoints(bodyA=obstacle, physicsClientId=self._clients[world]):
+                if point[8] > 0.0:  # a gap: Bullet reports near pairs too
                     continue
-                for point in bullet.getContactPoints(bodyA=obstacle, physicsClientId=self._clients[world]):
-                    if point[8] > 0.0:  # a gap: Bullet reports near pairs too
-                        continue
-                    if point[2] == self._object[world]:
-                        self._contact[world, 2] = True
-                    else:
-                        self._contact[world, int(point[4] >= len(_BASE_LINKS))] = True
+                if point[2] == self._object[world]:
+                    self._contact[world, 2] = True
+                else:
+                    self._contact[world, int(point[4] >= len(_BASE_LINKS))] = True
 
     def _read_joints(self, world: int) -> None:
         entries = bullet.getJointStates(self._robot[world], self._index, physicsClientId=self._clients[world])

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 class SimulationError(RuntimeError):
@@ -100,13 +103,21 @@ class TorqueLaw(Protocol):
         """Plan the next ``ik_ticks`` ticks for all worlds."""
         ...
 
-    def torques(self, rows: slice, position: Any, velocity: Any) -> Any:
-        """Return joint torques ``[B, J]`` of some worlds from joint positions and velocities of the same shape."""
+    def solve_ik_of(self, world: int) -> None:
+        """Plan the next ``ik_ticks`` ticks for one world, on the CPU."""
+        ...
+
+    def torques(self, position: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
+        """Return joint torques ``[N, J]`` of all worlds from joint positions and velocities of the same shape."""
+        ...
+
+    def torques_of(self, world: int, joints: np.ndarray) -> list[float]:
+        """Return one world's joint torques from its joints' positions and velocities ``[2, J]``, on the CPU."""
         ...
 
 
 class Worlds(Protocol):
-    """N worlds that the task runs in. Arrays and tensors are of the kind that the control law works with."""
+    """N worlds that the task runs in."""
 
     def reset(self, rows: torch.Tensor, scene: SceneState) -> None:
         """Put the worlds ``rows`` at their start."""
@@ -116,7 +127,7 @@ class Worlds(Protocol):
         """Let static cubes appear: which ``[N, M]``, where ``[N, M, 3]``, their edges [m] ``[N, M]``."""
         ...
 
-    def mass_matrix(self) -> Any:
+    def mass_matrix(self) -> torch.Tensor:
         """Return the joint-space inertia ``[N, J, J]``."""
         ...
 

@@ -164,7 +164,7 @@ class PlanarWorlds:
         self._flat_jacobian = self._jacobian.flatten(1, 2)
 
     def _tick(self, law: TorqueLaw) -> None:
-        torque = law.torques(slice(None), self._position, self._velocity)
+        torque = law.torques(self._position, self._velocity)
         free = self._velocity + self._period * (self._inverse_inertia @ torque[..., None])[..., 0]
         impulse = self._pushing.solve(self._cube, self._pushers(free))
         recoil = self._flat_jacobian.mT @ impulse.permute(2, 1, 0).reshape(len(free), -1, 1)

@@ -44,3 +44,16 @@ def test_a_robots_kinematics_do_not_depend_on_the_batch():
     for row in (0, 4, 8):
         for part, alone in zip(whole, arm.forward(joints[row : row + 1]), strict=True):
             assert torch.equal(part[row], alone[0])
+
+
+def test_the_compiled_kinematics_are_those_of_the_chain():
+    """Catches offsets of other frames, a joint that turns the other way, and a Jacobian with swapped halves."""
+    arm = ArmKinematics()
+    joints = 6.0 * torch.rand(9, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 3.0
+    position, rotation, jacobian = arm.forward(joints)
+    expected, pose = arm._chain.jacobian(joints, ret_eef_pose=True)
+    torch.testing.assert_close(jacobian, expected, rtol=0.0, atol=1e-12)
+    torch.testing.assert_close(rotation, pose[:, :3, :3], rtol=0.0, atol=1e-12)
+    # The base frame is on the ground, the chain's root 0.026 m above it.
+    pose[:, 2, 3] += 0.026
+    torch.testing.assert_close(position, pose[:, :3, 3], rtol=0.0, atol=1e-12)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import TYPE_CHECKING
+
 import pybullet
 import pytest
 import torch
@@ -13,6 +14,9 @@ from cura_torchrl.envs.simulation.bullet import BulletWorlds
 from cura_torchrl.envs.simulation.interface import SimulationError
 from tests.worlds import TICKS, NoTorque, make_scene, make_worlds, place
 
+if TYPE_CHECKING:
+    import numpy as np
+
 
 class Throw(NoTorque):
     """A law that returns one torque for all joints."""
@@ -20,9 +24,9 @@ class Throw(NoTorque):
     def __init__(self, torque: float) -> None:
         self.torque = torque
 
-    def torques(self, rows: slice, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    def torques_of(self, world: int, joints: np.ndarray) -> list[float]:
         """Return the torque."""
-        return np.full_like(position, self.torque)
+        return [self.torque] * joints.shape[1]
 
 
 def test_a_torque_that_is_not_a_number_is_an_error_that_names_the_world():
