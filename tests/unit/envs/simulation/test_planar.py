@@ -35,9 +35,9 @@ class Push:
     def solve_ik(self) -> None:
         """Plan nothing."""
 
-    def torques(self, rows: slice, position: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
+    def torques(self, position: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
         """Return the torques."""
-        return self.torque[rows]
+        return self.torque
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
