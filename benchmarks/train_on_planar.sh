@@ -27,7 +27,7 @@ for method in "${methods[@]}"; do
   start=${START:-$runs/imitate-$sees} run=$runs/${NAME:-$method-$seed}
   if [ ! -d "$start/checkpoints" ]; then
     cura-torchrl imitate --run-dir "$start" --expert avoider --method "$sees" --simulator planar "${encoder[@]}" --num-envs 1024 \
-      --rounds 6 --steps 150 --epochs 10 --minibatch-size 2048
+      --rounds 8 --steps 150 --epochs 15 --minibatch-size 2048
   fi
   if [ -d "$run/checkpoints" ]; then
     cura-torchrl train --run-dir "$run" --total-frames "$frames" --resume

@@ -33,6 +33,8 @@ from cura_torchrl.trainers.methods import method
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
@@ -101,11 +103,11 @@ def imitate(config: ImitateConfig) -> Path:
     train_config = _train_config(config)
     networks = Networks(train_config)
     env = _make_env(train_config, config)
-    rounds: list[TensorDictBase] = []
+    rounds, played = [], _rounds(env, networks, config)
     try:
         for index in range(config.rounds):
             with one_thread():
-                rounds.append(_collect(env, networks, config, learner_drives=index > 0))
+                rounds.append(next(played))
             networks.observation_norm.update(rounds[-1][keys.OBSERVATION])
             data = torch.cat(rounds)
             error = _fit(networks, data, config)
@@ -142,21 +144,27 @@ def _make_env(train_config: TrainConfig, config: ImitateConfig) -> EnvBase:
 
 
 @torch.no_grad()
-def _collect(env: EnvBase, networks: Networks, config: ImitateConfig, *, learner_drives: bool) -> TensorDictBase:
-    """Return what the networks see and the expert's actions, batch size ``[F]``."""
+def _rounds(env: EnvBase, networks: Networks, config: ImitateConfig) -> Iterator[TensorDictBase]:
+    """Play on from round to round, so that ends of episodes are seen as often as their beginnings.
+
+    Yields:
+        What the networks see and the expert's actions in a round, batch size ``[F]``.
+    """
     expert = ScriptedAvoider() if config.expert == "avoider" else ScriptedPusher()
-    is_learner = (torch.arange(config.num_envs) % 2 == 0)[:, None] & torch.tensor(learner_drives)
-    carrier, noise, kept = env.reset(), torch.zeros(config.num_envs, 6), []
-    for _ in tqdm(range(config.steps), desc="collect", unit="step"):
-        label = expert(carrier.select(*expert.in_keys))[keys.ACTION]
-        own = networks.actor.module[0](carrier.select(*_SEEN_KEYS))["loc"]
-        kept.append(carrier.select(*_SEEN_KEYS).set(keys.ACTION, label))
-        # Ornstein-Uhlenbeck, correlated over about ten steps: white noise would average out.
-        noise = 0.9 * noise + config.noise * (1 - 0.9**2) ** 0.5 * torch.randn_like(noise)
-        _, carrier = env.step_and_maybe_reset(
-            carrier.set(keys.ACTION, (torch.where(is_learner, own, label) + noise).clamp(-1.0, 1.0))
-        )
-    return torch.cat(kept)
+    carrier, noise = env.reset(), torch.zeros(config.num_envs, 6)
+    for index in range(config.rounds):
+        is_learner = (torch.arange(config.num_envs) % 2 == 0)[:, None] & torch.tensor(index > 0)
+        kept = []
+        for _ in tqdm(range(config.steps), desc="collect", unit="step"):
+            label = expert(carrier.select(*expert.in_keys))[keys.ACTION]
+            own = networks.actor.module[0](carrier.select(*_SEEN_KEYS))["loc"]
+            kept.append(carrier.select(*_SEEN_KEYS).set(keys.ACTION, label))
+            # Ornstein-Uhlenbeck, correlated over about ten steps: white noise would average out.
+            noise = 0.9 * noise + config.noise * (1 - 0.9**2) ** 0.5 * torch.randn_like(noise)
+            _, carrier = env.step_and_maybe_reset(
+                carrier.set(keys.ACTION, (torch.where(is_learner, own, label) + noise).clamp(-1.0, 1.0))
+            )
+        yield torch.cat(kept)
 
 
 def _fit(networks: Networks, data: TensorDictBase, config: ImitateConfig) -> float:

@@ -9,11 +9,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE
+from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE, OBSERVATION_SLICES
 from cura_torchrl.envs.robots.scripted import ScriptedPusher
 from cura_torchrl.trainers.build import LATENT_SIZE, Networks
 from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, restore
-from cura_torchrl.trainers.imitate import ImitateConfig, _collect, _make_env, _train_config, imitate
+from cura_torchrl.trainers.imitate import ImitateConfig, _make_env, _rounds, _train_config, imitate
 from cura_torchrl.trainers.methods import method
 
 
@@ -80,16 +80,28 @@ def test_who_imitates_the_avoider_reads_the_map(avoiding):
 
 def test_the_avoiders_actions_are_what_is_learned():
     """Catches labels of the pusher that sees no obstacles: near an obstacle the two differ."""
-    config = ImitateConfig(expert="avoider", method="push", simulator="planar", num_envs=8, steps=60, noise=0.0)
-    kept = _one_round(config)
+    config = ImitateConfig(
+        expert="avoider", method="push", simulator="planar", num_envs=8, rounds=1, steps=60, noise=0.0
+    )
+    kept = _played(config)[0]
     blind = ScriptedPusher()(kept.select("observation").clone())["action"]
     assert (kept["action"] - blind).abs().amax() > 0.2
 
 
-def _one_round(config):
+def test_a_round_goes_on_where_the_last_one_ended():
+    """Catches rounds that begin anew: episodes longer than a round would never be seen to their end."""
+    config = ImitateConfig(num_envs=2, rounds=2, steps=20, noise=0.0)
+    first, second = (kept["observation"][:, OBSERVATION_SLICES["goal_position"]] for kept in _played(config))
+    one_step = 0.8 * 0.2  # [m] at the base's full speed
+    turn = 0.2 * first[-2:].norm(dim=-1).amax()  # by 1 rad/s
+    assert (second[:2] - first[-2:]).norm(dim=-1).amax() < one_step + turn
+    assert (first[-2:] - first[:2]).norm(dim=-1).amin() > 0.5, "the robots have moved on"
+
+
+def _played(config):
     train_config = _train_config(config)
     with closing(_make_env(train_config, config)) as env:
-        return _collect(env, Networks(train_config), config, learner_drives=False)
+        return list(_rounds(env, Networks(train_config), config))
 
 
 def test_fitting_reduces_the_error_of_the_action(tmp_path, caplog):
