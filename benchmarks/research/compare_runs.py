@@ -30,8 +30,8 @@ PANELS = (
     ("collision", "collision rate [1]"),
     ("timeout", "time-out rate [1]"),
     ("object_speed", "object's speed [m/s]"),
-    ("unseen_ahead", "unseen share of the area ahead [1]"),
-    ("beside_q90_m", "base beside the object's way, 90 % quantile [m]"),
+    ("unseen_ahead", "unseen of the area ahead [1]"),
+    ("beside_q90_m", "beside the object's way, 90 % quantile [m]"),
 )
 
 
@@ -90,7 +90,7 @@ def paired(first: dict[str, Any], second: dict[str, Any]) -> list[float]:
 
 def draw(runs: dict[str, dict[str, Any]]) -> Figure:
     """Return the figure: a panel a measure, a bar a run."""
-    figure = Figure(figsize=(11, 1.6 + 0.5 * len(runs)), layout="constrained")
+    figure = Figure(figsize=(12, 1.6 + 0.5 * len(runs)), layout="constrained")
     for axis, (name, label) in zip(figure.subplots(2, 3, sharey=True).flat, PANELS, strict=True):
         values = [np.atleast_1d(result[name]) for result in runs.values()]
         middle = np.array([value[0] for value in values])
