@@ -33,7 +33,7 @@ class BenchConfig:
     sweep: tuple[int, ...] = (16, 32)
     """Other numbers of worlds that env tries in one process [1]."""
     planar_envs: int = 1024
-    """Worlds of the planar simulator [1]."""
+    """Worlds of the planar simulator over all processes [1]."""
     peer_envs: int = 8
     """Worlds of peers, which are as many processes for the others [1]; a multiple of the number of workers."""
     maps: int = 1024

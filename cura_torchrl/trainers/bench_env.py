@@ -200,19 +200,22 @@ def measure_sweep(config: BenchConfig, report: Report) -> None:
 
 
 def measure_processes(config: BenchConfig, report: Report) -> None:
-    """Compare several processes with one, and the planar simulator in one process with them.
+    """Compare several processes with one, and the planar simulator with PyBullet in as many.
 
     Args:
         config: How.
         report: Where the figures go.
     """
     with Workers(config.num_workers) as workers:
-        play_some = functools.partial(workers.play, num_envs=config.num_envs, steps=config.steps)
+        play_some = functools.partial(workers.play, "bullet", num_envs=config.num_envs, steps=config.steps)
+        share = -(-config.planar_envs // config.num_workers)
         taken = measure(
             {
                 "one process": functools.partial(play_some, 1),
                 "processes": functools.partial(play_some, config.num_workers),
-                "planar": functools.partial(play_planar, config),
+                "planar": functools.partial(
+                    workers.play, "planar", config.num_workers, num_envs=share, steps=config.steps
+                ),
             },
             config.rounds,
             "processes",
@@ -221,13 +224,13 @@ def measure_processes(config: BenchConfig, report: Report) -> None:
     work = config.num_envs * config.steps
     one = rates(work, taken["one process"])
     several = rates(config.num_workers * work, taken["processes"])
-    planar = rates(config.planar_envs * config.steps, taken["planar"])
+    planar = rates(config.num_workers * share * config.steps, taken["planar"])
     processes = f"{config.num_workers} processes"
     report.add_figure(f"PyBullet, 1 process of {config.num_envs} worlds", one, UNIT)
     report.add_figure(f"PyBullet, {processes} of {config.num_envs} worlds", several, UNIT)
-    report.add_figure(f"planar, 1 process of {config.planar_envs} worlds", planar, UNIT)
+    report.add_figure(f"planar, {processes} of {share} worlds", planar, UNIT)
     report.add_ratio(f"PyBullet, {processes} / 1", several, one, ">= 1.7")
-    report.add_ratio(f"planar / PyBullet in {processes}", planar, several)
+    report.add_ratio(f"planar / PyBullet, {processes} each", planar, several, ">= 10")
 
 
 class Workers:
@@ -251,10 +254,11 @@ class Workers:
         """Stop the processes."""
         self._stack.close()
 
-    def play(self, count: int, *, num_envs: int, steps: int) -> float:
+    def play(self, simulator: Simulator, count: int, *, num_envs: int, steps: int) -> float:
         """Play in some of the processes at once.
 
         Args:
+            simulator: Which simulator.
             count: In how many.
             num_envs: Worlds of each.
             steps: Policy steps.
@@ -263,9 +267,9 @@ class Workers:
             Seconds on the wall until the last of them has done.
         """
         pools = self._pools[:count]
-        _wait([pool.submit(prepare, "bullet", num_envs) for pool in pools])
+        _wait([pool.submit(prepare, simulator, num_envs) for pool in pools])
         start = time.perf_counter()
-        _wait([pool.submit(play, "bullet", num_envs, steps) for pool in pools])
+        _wait([pool.submit(play, simulator, num_envs, steps) for pool in pools])
         return time.perf_counter() - start
 
 
@@ -321,22 +325,6 @@ def act_at_random(env: EnvBase, data: TensorDictBase, steps: int) -> TensorDictB
     for _ in range(steps):
         data = env.step_and_maybe_reset(env.rand_action(data))[1]
     return data
-
-
-def play_planar(config: BenchConfig) -> float:
-    """Play on the planar simulator, with a thread for each process that PyBullet has.
-
-    Args:
-        config: Numbers of worlds, steps and threads.
-
-    Returns:
-        Seconds on the wall.
-    """
-    prepare("planar", config.planar_envs)
-    torch.set_num_threads(config.num_workers)
-    seconds = play("planar", config.planar_envs, config.steps)
-    torch.set_num_threads(1)
-    return seconds
 
 
 def close_all() -> None:
