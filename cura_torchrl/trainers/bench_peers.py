@@ -172,7 +172,9 @@ def measure_vectors(config: BenchConfig, report: Report) -> None:
         bench_env.prepare("bullet", count)
         plays: dict[str, Callable[[], float]] = {
             "one process": functools.partial(bench_env.play, "bullet", count, config.steps),
-            "batched": functools.partial(batches.play, "bullet", workers, num_envs=count // workers, steps=config.steps),
+            "batched": functools.partial(
+                batches.play, "bullet", workers, num_envs=count // workers, steps=config.steps
+            ),
             "ParallelEnv": functools.partial(_play_torchrl, singles, config.steps),
             "AsyncVectorEnv": functools.partial(_play_gym, gym, config.steps),
         }
