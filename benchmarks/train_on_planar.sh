@@ -4,7 +4,7 @@
 #   benchmarks/train_on_planar.sh RUNS FRAMES METHOD... [-- FLAG...]
 # FLAG... is handed to `cura-torchrl train`. ENCODER=<file> takes another encoder than the one that is shipped, SEED=<n> another seed,
 # NAME=<folder> another name than METHOD-SEED, START=<run> another start, WORKERS=<n> processes. benchmarks/training/map_vae.pt is the
-# encoder of both simulators' maps that the experiments in docs/research were run with.
+# encoder of both simulators' maps that the experiments in docs/research were run with, benchmarks/training/imitate-* the warm starts.
 set -euo pipefail
 runs=$1 frames=$2
 shift 2
