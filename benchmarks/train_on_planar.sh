@@ -25,7 +25,7 @@ for method in "${methods[@]}"; do
     *) sees=push-conf ;;
   esac
   start=${START:-$runs/imitate-$sees} run=$runs/${NAME:-$method-$seed}
-  if [ ! -d "$start/checkpoints" ]; then
+  if [ -z "${START:-}" ] && [ ! -d "$start/checkpoints" ]; then
     cura-torchrl imitate --run-dir "$start" --expert avoider --method "$sees" --simulator planar "${encoder[@]}" --num-envs 1024 \
       --rounds 8 --steps 150 --epochs 15 --minibatch-size 2048
   fi
