@@ -15,16 +15,13 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from recording import PERIOD, bootstrap, save
+from recording import KINDS, PERIOD, SIZES, bootstrap, save, share_of, task
 
 from cura_torchrl.trainers.active_perception import LookingMeter
 from cura_torchrl.trainers.checkpoint import LoadedPolicy, load_policy
-from cura_torchrl.trainers.evaluate import Episode, play_episodes
-from cura_torchrl.trainers.statistics import wilson_interval
+from cura_torchrl.trainers.evaluate import Episode, play_episodes, summarise
 from cura_torchrl.trainers.threads import one_thread
 
-SIZES = (0.5, 0.75, 1.0)
-KINDS = ("uniform", "adversarial")
 PANELS = (
     ("success", "success rate [1]"),
     ("collision", "collision rate [1]"),
@@ -39,15 +36,10 @@ def play(
     loaded: LoadedPolicy, kind: Any, size: float, options: argparse.Namespace
 ) -> tuple[list[Episode], dict[str, float]]:
     """Return how the scenes of a cell are played, and how much is looked."""
-    trained = loaded.config.env.task
-    scenario = dataclasses.replace(
-        trained.scenario, kind=kind, object_edges=(size,), max_obstacles=options.max_obstacles
-    )
-    task = dataclasses.replace(
-        trained, scenario=scenario, stream="eval", privileged=True, random_first_age=False, curriculum=()
-    )
+    scenes = task(loaded, kind=kind, object_edges=(size,), max_obstacles=options.max_obstacles)
+    scenes = dataclasses.replace(scenes, privileged=True)
     worlds = min(options.envs, options.episodes)
-    with closing(loaded.make_env(worlds, task=task, simulator="planar", seed=options.seed)) as env:
+    with closing(loaded.make_env(worlds, task=scenes, simulator="planar", seed=options.seed)) as env:
         meter = LookingMeter(env, loaded.config.env.lidar, PERIOD)
         episodes = play_episodes(env, loaded.policy, torch.arange(options.episodes), watch=meter.watch)
     return episodes, meter.summary()
@@ -55,25 +47,16 @@ def play(
 
 def outcome(cells: dict[str, tuple[list[Episode], dict[str, float]]]) -> dict[str, Any]:
     """Return rates over all cells with intervals, means of the measures, and the outcomes scene by scene."""
-    episodes = [episode for played, _ in cells.values() for episode in played]
-    flags = {
-        "success": [episode.success[0] for episode in episodes],
-        "collision": [episode.collision for episode in episodes],
-        "timeout": [not episode.success[0] and not episode.collision for episode in episodes],
-    }
+    total = summarise([episode for played, _ in cells.values() for episode in played])
+    counts = {"success": total["successes"], "collision": total["collisions"], "timeout": total["timeouts"]}
     measures = [measure for _, measure in cells.values()]
+    found = {cell: (summarise(played), measure) for cell, (played, measure) in cells.items()}
     return {
-        **{name: [sum(f) / len(f), *wilson_interval(sum(f), len(f))] for name, f in flags.items()},
+        **{name: share_of(count, total["episodes"]) for name, count in counts.items()},
         **{name: float(np.mean([measure[name] for measure in measures])) for name in measures[0]},
         "cells": {
-            cell: {
-                "success": sum(episode.success[0] for episode in played) / len(played),
-                **measure,
-                "outcomes": "".join(
-                    "s" if episode.success[0] else "c" if episode.collision else "t" for episode in played
-                ),
-            }
-            for cell, (played, measure) in cells.items()
+            cell: {"success": own["success_rate"], **measure, "outcomes": own["outcomes"]}
+            for cell, (own, measure) in found.items()
         },
     }
 

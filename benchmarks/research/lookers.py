@@ -50,9 +50,9 @@ class SeeingPusher(ScriptedAvoider):
         elapsed = tensordict[keys.ELAPSED_STEPS][:, 0]
         fresh = elapsed == 0 if len(self.known) == len(elapsed) else torch.ones_like(elapsed, dtype=torch.bool)
         self._forget(fresh)
-        seen = (tensordict[key] for key in (keys.SCAN, keys.SENSOR_POSE, keys.OBSTACLES))
-        self.known = self.known | obstacles_hit(*seen, self.max_range)
         obstacles = tensordict[keys.OBSTACLES].clone()
+        hit = obstacles_hit(tensordict[keys.SCAN], tensordict[keys.SENSOR_POSE], obstacles, self.max_range)
+        self.known = self.known | hit
         obstacles[..., 3] *= self.known
         seen = super().forward(tensordict.copy().set(keys.OBSTACLES, obstacles))
         waits = (elapsed * PERIOD < self.wait)[:, None]

@@ -17,15 +17,14 @@ import numpy as np
 import torch
 from lookers import PeekingPusher, SeeingPusher, SwingingPusher, WeavingPusher
 from matplotlib.figure import Figure
-from recording import PERIOD, bootstrap, gaps, save
+from recording import KINDS, PERIOD, SIZES, bootstrap, gaps, save, share_of
 
 from cura_torchrl import keys
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.config import LidarConfig, PushEnvConfig, ScenarioConfig, TaskConfig
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.push import PushEnv
-from cura_torchrl.trainers.evaluate import Episode, play_episodes
-from cura_torchrl.trainers.statistics import wilson_interval
+from cura_torchrl.trainers.evaluate import Episode, play_episodes, summarise
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
@@ -36,8 +35,6 @@ if TYPE_CHECKING:
 
 MOVING = 0.2
 """Speed above which the object counts as moving [m/s]."""
-SIZES = (0.5, 0.75, 1.0)
-KINDS = ("uniform", "adversarial")
 STRATEGIES: dict[str, Callable[[], SeeingPusher]] = {
     "straight": SeeingPusher,
     "no occlusion": SeeingPusher,
@@ -82,18 +79,17 @@ def play(
 
 def outcome(episodes: list[Episode], known: list[bool], beside: torch.Tensor) -> dict[str, Any]:
     """Return the counts and Wilson's intervals of a cell, and the outcomes scene by scene."""
-    success = [episode.success[0] for episode in episodes]
-    collision = [episode.collision for episode in episodes]
-    count = len(episodes)
+    total = summarise(episodes)
+    count = total["episodes"]
     return {
         "episodes": count,
-        "success": [sum(success) / count, *wilson_interval(sum(success), count)],
-        "collision": [sum(collision) / count, *wilson_interval(sum(collision), count)],
+        "success": share_of(total["successes"], count),
+        "collision": share_of(total["collisions"], count),
         "collisions_with_known": sum(known),
         "beside_m": {f"q{round(100 * share)}": round(float(beside.quantile(share)), 3) for share in (0.5, 0.9)},
-        "timeout": 1.0 - (sum(success) + sum(collision)) / count,
-        "mean_seconds": PERIOD * sum(episode.steps for episode in episodes) / count,
-        "outcomes": "".join("s" if s else "c" if c else "t" for s, c in zip(success, collision, strict=True)),
+        "timeout": total["timeouts"] / count,
+        "mean_seconds": PERIOD * total["mean_steps"],
+        "outcomes": total["outcomes"],
     }
 
 

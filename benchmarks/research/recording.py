@@ -21,6 +21,7 @@ from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.objectives.functional import normalise, risk_cost, uncertainty_cost
 from cura_torchrl.trainers.active_perception import unseen_ahead
 from cura_torchrl.trainers.info import provenance
+from cura_torchrl.trainers.statistics import wilson_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,6 +36,10 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 
 PERIOD = 0.2
 """Time of a policy step [s]."""
+SIZES = (0.5, 0.75, 1.0)
+"""Edges of the object in the six cells [m]."""
+KINDS = ("uniform", "adversarial")
+"""Their scenarios."""
 BURN_IN = 64
 """Steps that are played before recording, in which episodes that begin together spread out [1]."""
 
@@ -173,6 +178,11 @@ def normalised_costs(loaded: LoadedPolicy, notes: dict[str, NDArray[Any]]) -> di
     total = cura.risk_coeff * risk + cura.uncertainty_coeff * uncertainty
     named = {"raw_risk": raw_risk, "raw_uncertainty": raw_uncertainty, "risk": risk, "uncertainty": uncertainty}
     return {name: value.numpy() for name, value in {**named, "sum": total}.items()}
+
+
+def share_of(count: int, episodes: int) -> list[float]:
+    """Return a rate with Wilson's 95 % interval [1]."""
+    return [count / episodes, *wilson_interval(count, episodes)]
 
 
 def bootstrap(

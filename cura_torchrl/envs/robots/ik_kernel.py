@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from cura_torchrl.compiled import compiled
-
-Doubles: TypeAlias = npt.NDArray[np.float64]
+from cura_torchrl.compiled import Doubles, compiled
 
 _BASE_DOF, _ARM_DOF = 3, 7
 

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
-from cura_torchrl.compiled import compiled
-
-Doubles: TypeAlias = npt.NDArray[np.float64]
+from cura_torchrl.compiled import Doubles, compiled
 
 _BASE_DOF = 3
 
