@@ -47,6 +47,23 @@ def dot(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     return total
 
 
+def matvec(matrix: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+    """Return the products of matrices and vectors.
+
+    Args:
+        matrix: Matrices, shape ``[*, R, C]``.
+        vector: Vectors, shape ``[*, C]``.
+
+    Returns:
+        Vectors in the product of the units, shape ``[*, R]``.
+
+    Examples:
+        >>> matvec(torch.tensor([[1.0, 2.0], [0.0, 3.0]]), torch.tensor([1.0, 1.0])).tolist()
+        [3.0, 3.0]
+    """
+    return (matrix @ vector[..., None])[..., 0]
+
+
 def norm(vector: torch.Tensor) -> torch.Tensor:
     """Return the Euclidean length over the last dimension.
 

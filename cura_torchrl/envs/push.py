@@ -383,7 +383,7 @@ class PushEnv(EnvBase):
         state, tcp = self.world_state, self._tcp
         base = geometry.rotate(state.base_velocity[:, :2], -state.base_pose[:, 2])
         spin = state.base_velocity[:, 2]
-        arm = (self._jacobian[:, :3] @ state.joint_velocity[:, :, None])[:, :, 0]
+        arm = geometry.matvec(self._jacobian[:, :3], state.joint_velocity)
         carried = [base[:, 0] - spin * tcp[:, 1], base[:, 1] + spin * tcp[:, 0], torch.zeros_like(spin)]
         return arm + torch.stack(carried, dim=-1)
 

@@ -180,7 +180,8 @@ def make_env(config: TrainConfig, num_envs: int, *, keep_map: bool = False, **op
     else:
         transforms.append(ObstacleCode(LATENT_SIZE, is_blind=config.perception == "none"))
     options.setdefault("seed", config.seed)
-    return TransformedEnv(PushEnv(num_envs, env_config, **options), Compose(*transforms))
+    env = PushEnv(num_envs, env_config, **options)
+    return TransformedEnv(env, Compose(*transforms).to(env.device))
 
 
 def make_worker_env(config: TrainConfig, num_envs: int, *, worker: int, frames_done: int) -> EnvBase:
@@ -203,6 +204,7 @@ def make_worker_env(config: TrainConfig, num_envs: int, *, worker: int, frames_d
     return make_env(
         config,
         num_envs,
+        device=None if config.env_device == "cpu" else config.env_device,
         # An episode lasts a step at least: scenarios from this index on have not been played before a resume.
         first_episode=frames_done + worker * num_envs,
         episode_stride=config.num_envs,
@@ -223,7 +225,7 @@ def build_collector(
 
     Args:
         config: Number of environments and processes.
-        policy: Policy on the CPU; processes share its memory.
+        policy: Policy on the environments' device; processes share its memory.
         frames_done: Environment steps so far.
         without: Ray's identifiers of nodes that have died.
 

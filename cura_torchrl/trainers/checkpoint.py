@@ -193,7 +193,7 @@ def restore(path: Path, components: Mapping[str, Any]) -> None:
         CheckpointError: If a component is missing or does not fit.
     """
     try:
-        _coordinator(components).load(path)
+        _coordinator(components).load(path, map_location="cpu")  # from where components copy to their own device
     except (RuntimeError, ValueError, KeyError, TypeError, AttributeError, OSError) as error:
         reason = " ".join(str(error).split())[:300]
         msg = f"checkpoint {path} does not fit this configuration: {reason}"

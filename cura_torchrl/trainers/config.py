@@ -178,7 +178,8 @@ class TrainConfig:
     encoder: Path | None = None
     """Weights of the map's encoder, as ``pretrain-map`` writes them; none takes those that are shipped."""
     device: str = "cpu"
-    """Device that learns, such as cpu or cuda; the environments stay on the CPU."""
+    """Device that learns, such as cpu or cuda. Where one process collects, the planar simulator's worlds are on it too,
+    with LiDAR, map, encoder and policy; PyBullet's worlds, and those of several workers, are on the CPU."""
     learner_threads: int = 2
     """Threads of the learner on the CPU [1]; each worker has one."""
     logger: LoggerKind = "csv"
@@ -229,6 +230,12 @@ class TrainConfig:
         require(
             self.env.simulator == self.simulator, "env.simulator", self.env.simulator, f"simulator {self.simulator!r}"
         )
+
+    @property
+    def env_device(self) -> str:
+        """Device of environments and of the policy that acts in them."""
+        is_here = self.num_workers == 1 and self.backend == "process"
+        return self.device if is_here and self.simulator == "planar" else "cpu"
 
     @property
     def frames_per_batch(self) -> int:

@@ -58,7 +58,7 @@ class Learner:
         }
         size = min(config.ppo.minibatch_size, config.frames_per_batch)
         self._buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(config.frames_per_batch),
+            storage=LazyTensorStorage(config.frames_per_batch, device=config.device),
             sampler=SamplerWithoutReplacement(drop_last=True),
             batch_size=size,
         )
@@ -112,11 +112,11 @@ class Learner:
         metrics = self._estimate(data)
         self._buffer.empty()
         self._buffer.extend(data.select(*_MINIBATCH_KEYS).reshape(-1))
-        sums: dict[str, torch.Tensor] = defaultdict(lambda: torch.zeros(()))
+        sums: dict[str, torch.Tensor] = defaultdict(lambda: torch.zeros((), device=self._config.device))
         count = 0
         for _ in range(self._config.ppo.epochs):
             for minibatch in self._buffer:
-                for name, value in self._step(minibatch.to(self._config.device)).items():
+                for name, value in self._step(minibatch).items():
                     sums[name] = sums[name] + value
                 count += 1
         # After the last gradient step and before the next rollout: the policy that collects and the policy whose ratio

@@ -105,8 +105,8 @@ class _Run:
         torch.manual_seed(config.seed)
         self.learner = Learner(config, Networks(config))
         networks = self.learner.networks
-        # The environments stay on the CPU, and so does the policy that acts in them.
-        self.policy = networks.actor if config.device == "cpu" else copy.deepcopy(networks.actor).cpu()
+        is_shared = config.env_device == config.device
+        self.policy = networks.actor if is_shared else copy.deepcopy(networks.actor).to(config.env_device)
         self.components = {**self.learner.components(), "rng": GlobalRNGState()}
         self.saved_at = time.monotonic()
         source = self._source(resume)

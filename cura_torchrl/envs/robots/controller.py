@@ -110,6 +110,10 @@ class ImpedanceController:
         self.tcp_reference[rows] = self.tcp_reference.new_tensor(model.HOME_TCP)
         self._workspace[rows, 2, 1] = height_limit.to(self._workspace).clamp_max(self.config.workspace_z[1])
 
+    def state(self) -> tuple[torch.Tensor, ...]:
+        """Return what a policy step changes, in place: the motion of base and joints, and the TCP's reference."""
+        return self._motion, self.tcp_reference
+
     def command(self, action: torch.Tensor, object_xy_b: torch.Tensor, mass_matrix: torch.Tensor) -> None:
         """Take the action of a policy step.
 
@@ -128,7 +132,7 @@ class ImpedanceController:
         # tau = M (M + D dt + K dt^2)^-1 (...): the implicit (stable) form of the impedance law.
         stiffness, damping = self._constants[:2]
         implicit = mass_matrix + torch.diag(damping * self.period + stiffness * self.period**2)
-        self._gain[...] = mass_matrix @ torch.linalg.inv(implicit)
+        self._gain[...] = mass_matrix @ torch.linalg.inv_ex(implicit).inverse
 
     def torques(self, position: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
         """Return the joint torques of one tick; :meth:`solve_ik` sets where the robots head.
@@ -156,7 +160,7 @@ class ImpedanceController:
         )
         error = reference - arm_position - self.period * arm_velocity
         force = torch.cat([base_force, stiffness * error - damping * arm_velocity], dim=-1)
-        torque = (self._gain @ force[:, :, None])[:, :, 0]
+        torque = geometry.matvec(self._gain, force)
         arm = torque[:, BASE_DOF:]
         torch.minimum(torch.maximum(arm, -limit, out=arm), limit, out=arm)
         return torque
@@ -197,7 +201,7 @@ class ImpedanceController:
         twist = torch.cat([self._linear(tcp), self._angular(tcp, rotation)], dim=-1)
         rate, free = damped_least_squares(jacobian, twist, self.config.ik_damping)
         posture = self.config.posture_gain * (self._home - reference)
-        rate = rate + (free @ posture[:, :, None])[:, :, 0]
+        rate = rate + geometry.matvec(free, posture)
         self._rate[...] = torch.maximum(torch.minimum(rate, self._speed), -self._speed)
 
     def solve_ik_of(self, world: int) -> None:

@@ -54,6 +54,7 @@ class RobotDynamics:
         urdf = URDF.read_bytes()
         chain = pk.build_serial_chain_from_urdf(urdf, TCP_LINK, root_link_name=BASE_LINK)
         self._chain = chain.to(dtype=torch.float64, device=device)
+        self._links = self._chain.get_frame_indices(*ARM_LINKS).to(device)
         masses = _rigid_groups(ElementTree.fromstring(urdf))
 
         def stack(links: tuple[str, ...]) -> _Inertia:
@@ -80,8 +81,7 @@ class RobotDynamics:
             Featherstone (2008), "Rigid Body Dynamics Algorithms", section 6.2: the composite-rigid-body algorithm, all
             in one frame.
         """
-        poses = self._chain.forward_kinematics(joint_position[:, 3:], end_only=False)
-        frames = torch.stack([poses[link].get_matrix() for link in ARM_LINKS], dim=1)
+        frames = self._chain.forward_kinematics_tensor(joint_position[:, 3:])[self._links].movedim(0, 1)
         rotation, position = frames[..., :3, :3], frames[..., :3, 3]
         bodies = self._arm.moved(rotation, position)
         # What each joint carries: all links from its own to the hand; the base's joints carry those and the base.
@@ -107,7 +107,7 @@ class RobotDynamics:
         turn = torch.stack([torch.stack([cos, sin], -1), torch.stack([-sin, cos], -1)], -2)  # world to base
         matrix[:, :2] = turn.mT @ matrix[:, :2]
         matrix[:, :, :2] = matrix[:, :, :2] @ turn
-        matrix[:, [0, 1], [0, 1]] += self._slides
+        matrix.diagonal(dim1=1, dim2=2)[:, :2] += self._slides
         return matrix
 
 

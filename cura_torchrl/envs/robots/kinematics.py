@@ -9,6 +9,7 @@ from __future__ import annotations
 import pytorch_kinematics as pk
 import torch
 
+from cura_torchrl.envs import geometry
 from cura_torchrl.envs.robots.ik_kernel import place_hands
 from cura_torchrl.envs.robots.ridgeback_franka import ARM_LINKS, BASE_LINK, BASE_LINK_HEIGHT, TCP_LINK, URDF
 
@@ -87,6 +88,7 @@ def damped_least_squares(
     rows, joints = jacobian.shape[-2:]
     transposed = jacobian.mT
     gram = jacobian @ transposed + damping**2 * torch.eye(rows, dtype=jacobian.dtype, device=jacobian.device)
-    inverse = torch.linalg.solve(gram, jacobian).mT  # J^T (J J^T + lambda^2 I)^-1, the Gram matrix being symmetric
-    velocity = (inverse @ twist[..., None])[..., 0]
+    # J^T (J J^T + lambda^2 I)^-1, the Gram matrix being symmetric; solve_ex waits for no answer of the device.
+    inverse = torch.linalg.solve_ex(gram, jacobian).result.mT
+    velocity = geometry.matvec(inverse, twist)
     return velocity, torch.eye(joints, dtype=jacobian.dtype, device=jacobian.device) - inverse @ jacobian

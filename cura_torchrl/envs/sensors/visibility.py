@@ -158,8 +158,9 @@ def seen_free(
     dx, dy = (row_x - sensor_pose[:, :1])[..., None], (column_y - sensor_pose[:, 1:2])[:, None]
     start = (math.pi - sensor_pose[:, 2].double()) * per_radian + 0.5
     start = start.remainder(num_rays).float()[:, None, None]
-    ray = torch.atan2(dy, dx).mul_(per_radian).add_(start).floor_().long().remainder_(num_rays)
-    reach = (scan - margin).clamp_min(0.0).square()
+    # From -R / 2 to 3 R / 2: three turns in a row cost less than a remainder.
+    ray = torch.atan2(dy, dx).mul_(per_radian).add_(start).floor_().add_(num_rays).long()
+    reach = (scan - margin).clamp_min(0.0).square().repeat(1, 3)
     return dx.square() + dy.square() < reach.gather(1, ray.flatten(1)).view(ray.shape)
 
 

@@ -99,6 +99,10 @@ class TorqueLaw(Protocol):
     ik_ticks: int
     hand: HandLinearization
 
+    def state(self) -> tuple[torch.Tensor, ...]:
+        """Return the tensors that a policy step changes; they keep their memory."""
+        ...
+
     def solve_ik(self) -> None:
         """Plan the next ``ik_ticks`` ticks for all worlds."""
         ...

@@ -12,6 +12,7 @@ import torch
 
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.simulation.contact import Rectangle, overlap
+from cura_torchrl.envs.simulation.cuda_graph import CudaGraph
 from cura_torchrl.envs.simulation.interface import HandLinearization, SimulationError, WorldState
 from cura_torchrl.envs.simulation.pushing import Cube, PushContact, Pushers
 from cura_torchrl.envs.simulation.rays import free_share
@@ -34,7 +35,7 @@ class Dynamics(Protocol):
 
 
 class PlanarWorlds:
-    """N planar worlds: floor, robot, cube, obstacles.
+    """N planar worlds: floor, robot, cube, obstacles. Their state is changed in place: a CUDA graph knows its memory.
 
     Args:
         num_worlds: Number of worlds N.
@@ -59,7 +60,9 @@ class PlanarWorlds:
             return torch.zeros(num_worlds, *size, dtype=torch.float64, device=device)
 
         self._position, self._velocity = zeros(10), zeros(10)
-        self._inertia = torch.eye(10, dtype=torch.float64, device=device).expand(num_worlds, 10, 10)
+        self._graph: CudaGraph | None = None
+        self._is_captured = physics.planar_graph and self._position.device.type == "cuda"
+        self._inertia = torch.eye(10, dtype=torch.float64, device=device).repeat(num_worlds, 1, 1)
         self._inverse_inertia = zeros(10, 10)
         self._cube = Cube(zeros(3), zeros(3), zeros() + 1.0, zeros() + 1.0, zeros() + 1.0, zeros(3))
         self._pushing = PushContact(num_worlds, 2, physics, device)
@@ -69,10 +72,10 @@ class PlanarWorlds:
         self._obstacle_pose, self._obstacle_edge = zeros(0, 3), zeros(0)
         self._contact = torch.zeros(num_worlds, 3, dtype=torch.bool, device=device)
         self._jacobian = zeros(2, 4, 10)
-        self._jacobian[:, 1, [0, 1, 3], [0, 1, 2]] = 1.0  # the chassis: the base's own velocity
+        self._jacobian[:, :, [0, 1, 3], [0, 1, 2]] = 1.0  # hand and chassis move as the base does
         self._flat_jacobian, self._mobility = zeros(8, 10), zeros(4, 4, 2)
         self._hand = HandLinearization(zeros(3), zeros(3, 3), zeros(6, 7), reference=zeros(7))
-        self._hand_yaw, self._hand_front = zeros(), zeros()
+        self._hand_yaw, self._hand_front, self._hand_jacobian = zeros(), zeros(), zeros(4, 7)
 
     def close(self) -> None:
         """Do nothing: there is nothing to release."""
@@ -87,6 +90,7 @@ class PlanarWorlds:
         if self._obstacle_edge.shape[1] != scene.num_slots:
             self._obstacle_pose = self._position.new_zeros(self.num_worlds, scene.num_slots, 3)
             self._obstacle_edge = self._position.new_zeros(self.num_worlds, scene.num_slots)
+            self._graph = None
         cube = self._cube
         self._position[rows], self._velocity[rows] = scene.joint_position.to(self._position), 0.0
         for own, start in (
@@ -111,15 +115,15 @@ class PlanarWorlds:
             pose: Their centres (x [m], y [m], yaw [rad]) in the world frame, shape ``[N, M, 3]``.
             edge: Their edges [m], shape ``[N, M]``.
         """
-        self._obstacle_pose = torch.where(is_new[..., None], pose, self._obstacle_pose)
-        self._obstacle_edge = torch.where(is_new, edge, self._obstacle_edge)
+        self._obstacle_pose[...] = torch.where(is_new[..., None], pose, self._obstacle_pose)
+        self._obstacle_edge[...] = torch.where(is_new, edge, self._obstacle_edge)
 
     def mass_matrix(self) -> torch.Tensor:
         """Return the joint-space inertia of every robot [kg, kg m^2], shape ``[N, J, J]``.
 
         The ticks after it move the robots with this inertia: it changes little within a policy step.
         """
-        self._inertia = self._dynamics.mass_matrix(self._position)
+        self._inertia[...] = self._dynamics.mass_matrix(self._position)
         return self._inertia
 
     def advance(self, law: TorqueLaw, ticks: int) -> None:
@@ -132,18 +136,31 @@ class PlanarWorlds:
         Raises:
             SimulationError: If a state is not finite.
         """
-        self._contact = torch.zeros_like(self._contact)
-        self._inverse_inertia = torch.linalg.inv(self._inertia)
+        if self._is_captured:
+            if self._graph is None:
+                self._graph = CudaGraph(lambda: self._run(law, ticks), [*self._state(), *law.state()])
+            self._graph.replay()
+        else:
+            self._run(law, ticks)
+        finite = self._velocity.isfinite().all(-1) & self._cube.twist.isfinite().all(-1)
+        if not bool(finite.all()):
+            msg = f"worlds {(~finite).nonzero().flatten().tolist()} have a state that is not finite"
+            raise SimulationError(msg)
+
+    def _state(self) -> tuple[torch.Tensor, ...]:
+        """Return what a policy step changes."""
+        return self._position, self._velocity, self._contact, self._cube.pose, self._cube.twist, *self._pushing.state()
+
+    def _run(self, law: TorqueLaw, ticks: int) -> None:
+        self._contact[...] = False
+        # What cannot be inverted becomes a state that is not finite; to be told at once would wait for the device.
+        self._inverse_inertia = torch.linalg.inv_ex(self._inertia).inverse
         for start in range(0, ticks, law.ik_ticks):
             law.solve_ik()
             self._linearize(law.hand)
             for _ in range(min(law.ik_ticks, ticks - start)):
                 self._tick(law)
             self._note_contacts()
-        finite = self._velocity.isfinite().all(-1) & self._cube.twist.isfinite().all(-1)
-        if not bool(finite.all()):
-            msg = f"worlds {(~finite).nonzero().flatten().tolist()} have a state that is not finite"
-            raise SimulationError(msg)
 
     def _linearize(self, hand: HandLinearization) -> None:
         """Take over where the hand is and how it moves until the next IK solution."""
@@ -155,24 +172,24 @@ class PlanarWorlds:
         yaw = self._position[:, 2]
         reach = geometry.rotate(hand.tcp[:, :2], yaw)
         own = self._jacobian[:, 0]
-        own[:, [0, 1, 3], [0, 1, 2]] = 1.0
         own[:, 0, 2], own[:, 1, 2] = -reach[:, 1], reach[:, 0]
         own[:, :2, 3:] = geometry.rotate(hand.jacobian[:, :2].mT, yaw[:, None]).mT
         own[:, 2, 3:], own[:, 3, 3:] = hand.jacobian[:, 2], hand.jacobian[:, 5]
+        self._hand_jacobian = torch.cat([hand.jacobian[:, :3], hand.jacobian[:, 5:]], dim=1)
         mobility = self._jacobian @ self._inverse_inertia[:, None] @ self._jacobian.mT
         self._mobility = mobility.permute(2, 3, 1, 0).contiguous()
         self._flat_jacobian = self._jacobian.flatten(1, 2)
 
     def _tick(self, law: TorqueLaw) -> None:
         torque = law.torques(self._position, self._velocity)
-        free = self._velocity + self._period * (self._inverse_inertia @ torque[..., None])[..., 0]
+        free = self._velocity + self._period * geometry.matvec(self._inverse_inertia, torque)
         impulse = self._pushing.solve(self._cube, self._pushers(free))
-        recoil = self._flat_jacobian.mT @ impulse.permute(2, 1, 0).reshape(len(free), -1, 1)
-        self._velocity = self._stopped(free + (self._inverse_inertia @ recoil)[..., 0])
-        self._position = self._position + self._period * self._velocity
+        recoil = geometry.matvec(self._flat_jacobian.mT, impulse.permute(2, 1, 0).reshape(len(free), -1))
+        self._velocity[...] = self._stopped(free + geometry.matvec(self._inverse_inertia, recoil))
+        self._position += self._period * self._velocity
         # One pass over the stops leaves a residue where joints hit several at once: it must not add up.
         self._position[:, _ARM].clamp_(self._lower[:, 0], self._upper[:, 0])
-        self._cube.pose = self._cube.pose + self._period * self._cube.twist
+        self._cube.pose += self._period * self._cube.twist
 
     def _stopped(self, velocity: torch.Tensor) -> torch.Tensor:
         """Return joint velocities that lead no joint of the arm past its stops, by one impulse after the other."""
@@ -183,13 +200,13 @@ class PlanarWorlds:
             own, least = velocity[joint], (lower - position[joint]) / self._period
             allowed = torch.minimum(torch.maximum(own, least), (upper - position[joint]) / self._period)
             velocity = velocity + answers[joint] * ((allowed - own) / answers[joint, joint])
-        return velocity.T.contiguous()
+        return velocity.T
 
     def _hand_pose(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the TCP in the world [m] ``[N, 3]``, and the yaw of the hand's axis in the world [rad] ``[N]``."""
         hand = self._hand
         change = self._position[:, 3:] - hand.reference
-        moved = (hand.jacobian[:, [0, 1, 2, 5]] @ change[..., None])[..., 0]
+        moved = geometry.matvec(self._hand_jacobian, change)
         tcp = hand.tcp + moved[:, :3]
         base = self._position[:, :3]
         level = geometry.from_frame(base, tcp[:, :2])
@@ -204,7 +221,7 @@ class PlanarWorlds:
         anchor = torch.stack([tcp[:, :2], base[:, :2]]).permute(2, 0, 1)
         ahead = torch.stack([self._hand_front - self._half[0, 0], torch.zeros_like(yaw)])
         length, width = self._half.T[..., None].expand(2, 2, len(yaw))
-        twist = (self._flat_jacobian @ velocity[..., None]).view(len(yaw), 2, 4)
+        twist = geometry.matvec(self._flat_jacobian, velocity).view(len(yaw), 2, 4)
         return Pushers(
             rectangle=Rectangle(anchor[0] + ahead * cos, anchor[1] + ahead * sin, cos, sin, length, width),
             height=torch.stack([tcp[:, 2], torch.full_like(yaw, self._shape.chassis_height)]),
@@ -218,7 +235,7 @@ class PlanarWorlds:
         tcp, yaw = self._hand_pose()
         base, shape = self._position[:, :3], self._shape
         tip = tcp[:, :2] + self._hand_front[:, None] * torch.stack([yaw.cos(), yaw.sin()], dim=-1)
-        front = geometry.from_frame(base, base.new_tensor([shape.chassis_size[0] / 2, 0.0]).expand(len(base), 2))
+        front = base[:, :2] + self._half[1, 0] * torch.stack([base[:, 2].cos(), base[:, 2].sin()], dim=-1)
         arm = tip - front
         arm_pose = torch.cat([(front + tip) / 2, geometry.angle_of(arm)[:, None]], dim=-1)
         poses = torch.stack([base, arm_pose, self._cube_pose()])[..., None, :]
@@ -233,7 +250,7 @@ class PlanarWorlds:
             _rectangle(poses, halves[0, ..., None], halves[1, ..., None]),
             _rectangle(self._obstacle_pose, obstacle_half, obstacle_half),
         )
-        self._contact = self._contact | (touches & (self._obstacle_edge > 0)).any(-1).T
+        self._contact |= (touches & (self._obstacle_edge > 0)).any(-1).T
 
     def cast(self, rows: torch.Tensor, origin: torch.Tensor, ends: torch.Tensor, *, see_object: bool) -> torch.Tensor:
         """Cast rays against the squares that cube and obstacles are seen from above. Rays never see the robot.

@@ -111,11 +111,15 @@ class PushContact:
         self._impulse[..., rows] = 0.0
         self._load[:, rows] = (cube.mass * self._physics.gravity / 4)[rows]
 
+    def state(self) -> tuple[torch.Tensor, ...]:
+        """Return what a tick changes, beside the cubes: it keeps its memory."""
+        return self._floor_impulse, self._impulse, self._load
+
     def solve(self, cube: Cube, pushers: Pushers) -> torch.Tensor:
         """Change the cubes' twists by the impulses of one tick.
 
         Args:
-            cube: The cubes; ``twist`` is replaced.
+            cube: The cubes; ``twist`` is changed in place.
             pushers: What pushes, with the twists that they would have without contact.
 
         Returns:
@@ -125,19 +129,20 @@ class PushContact:
         floor = _Floor(cube, footprint, cube.friction * self._load * self._period)
         touch = _Touch(cube, footprint, pushers, self._physics)
         twist, pusher_twist = cube.twist.T.contiguous(), pushers.twist
-        twist = floor.push(twist, self._floor_impulse)
+        rubbing = self._floor_impulse
+        twist = floor.push(twist, rubbing)
         points: list[torch.Tensor] = list(self._impulse)
         for point, impulse in enumerate(points):
             twist, pusher_twist = touch.push(point, twist, pusher_twist, impulse)
         for _ in range(self._physics.planar_sweeps):
-            rubbed = floor.impulse(self._floor_impulse, twist)
-            twist = floor.push(twist, rubbed - self._floor_impulse)
-            self._floor_impulse = rubbed
+            last, rubbing = rubbing, floor.impulse(rubbing, twist)
+            twist = floor.push(twist, rubbing - last)
             for point, before in enumerate(points):
                 points[point] = touch.impulse(point, before, twist, pusher_twist)
                 twist, pusher_twist = touch.push(point, twist, pusher_twist, points[point] - before)
-        self._impulse = torch.stack(points)
-        cube.twist = twist.T.contiguous()
+        self._floor_impulse[...] = rubbing
+        self._impulse[...] = torch.stack(points)
+        cube.twist[...] = twist.T
         self._spread_load(cube, footprint, pushers.height, touch)
         return -touch.wrench(self._impulse)
 
@@ -155,7 +160,7 @@ class PushContact:
         about_y = moment_y / self._period + footprint.offset_y * total
         share = (footprint.corner_x * about_x + footprint.corner_y * about_y) / cube.edge**2
         load = (total / 4 + share).clamp_min(0.0)
-        self._load = load * (total / load.sum(0).clamp_min(_TINY))
+        self._load[...] = load * (total / load.sum(0).clamp_min(_TINY))
 
 
 class _Footprint:
