@@ -28,13 +28,13 @@ from cura_torchrl.trainers.diagnostics import (
     finished_episodes,
     rollout_statistics,
 )
-from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NodeLostError, WorkerError
+from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NodeLostError, UnavailableError, WorkerError
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.progress import Progress
 from cura_torchrl.trainers.ray_backend import RayRollouts, require_ray
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
     from types import FrameType
 
@@ -67,10 +67,24 @@ def train(config: TrainConfig, *, resume: bool = False, init_from: Path | None =
         WorkerError: If a process that collects has died, or no node is left that could.
         UnavailableError: If a part that was asked for is not installed.
     """  # noqa: DOC502 - raised by what this calls
+    _require_device(config.device)
     if config.backend == "ray":
         require_ray()
     with _locked(config.run_dir), _Signals() as signals:
         return _Run(config, resume=resume, init_from=init_from).loop(signals)
+
+
+class RandomState(GlobalRNGState):
+    """State of the process's random draws, without a GPU's where there is none: from there on the draws are others."""
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore it.
+
+        Args:
+            state_dict: What ``state_dict`` returned, on this machine or another.
+        """
+        is_there = torch.cuda.is_available()
+        super().load_state_dict({name: value for name, value in state_dict.items() if is_there or name != "torch_cuda"})
 
 
 def most_obstacles(task: TaskConfig, frames: int) -> int:
@@ -94,6 +108,15 @@ def most_obstacles(task: TaskConfig, frames: int) -> int:
     return reached[-1] if reached else 0
 
 
+def _require_device(name: str) -> None:
+    try:
+        torch.zeros(0, device=name)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        accepted = "cpu, or a device of this machine that its PyTorch was built for"
+        msg = f"device is {name!r} ({str(error).splitlines()[0]}); accepted: {accepted}"
+        raise UnavailableError(msg) from None
+
+
 class _Run:
     """State of a run between updates."""
 
@@ -107,7 +130,7 @@ class _Run:
         networks = self.learner.networks
         is_shared = config.env_device == config.device
         self.policy = networks.actor if is_shared else copy.deepcopy(networks.actor).to(config.env_device)
-        self.components = {**self.learner.components(), "rng": GlobalRNGState()}
+        self.components = {**self.learner.components(), "rng": RandomState()}
         self.saved_at = time.monotonic()
         source = self._source(resume)
         if source is not None:
