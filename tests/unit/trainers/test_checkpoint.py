@@ -66,6 +66,19 @@ def test_what_is_saved_comes_back(tmp_path: Path) -> None:
     assert {"versions", "commit"} <= set(record)
 
 
+def test_what_a_gpu_saved_comes_back_without_one(saved: Path) -> None:
+    """Catches weights that only a machine with a GPU can load."""
+    (state,) = saved.glob("components/*networks/state.json")
+    content = state.read_text(encoding="utf-8")
+    assert '"device":"cpu"' in content
+    state.write_text(content.replace('"device":"cpu"', '"device":"cuda:0"'), encoding="utf-8")
+    network = nn.Linear(3, 2)
+    before = network.weight.clone()
+    restore(saved, {"networks": network})
+    assert network.weight.device.type == "cpu"
+    assert not torch.equal(network.weight, before)
+
+
 def test_no_file_is_a_pickle(saved: Path) -> None:
     """Catches a format that runs code when it is loaded."""
     # Pickles of protocol 2 and later start with 0x80; torch.save writes a zip that holds data.pkl.

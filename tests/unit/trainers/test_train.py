@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 from typing import TYPE_CHECKING
@@ -13,10 +14,10 @@ from cura_torchrl.envs.config import TaskConfig
 from cura_torchrl.trainers import train as module
 from cura_torchrl.trainers.build import Networks, build_collector
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint, read_config
-from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NonFiniteError, WorkerError
+from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NonFiniteError, UnavailableError, WorkerError
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
-from cura_torchrl.trainers.train import most_obstacles, train
+from cura_torchrl.trainers.train import RandomState, most_obstacles, train
 from tests.runs import FRAMES, small_run
 
 if TYPE_CHECKING:
@@ -46,6 +47,34 @@ def test_a_run_writes_rows_and_checkpoints_and_goes_on_where_it_stopped(config: 
     assert frames_of(config) == [FRAMES, 2 * FRAMES, 3 * FRAMES]
     assert read_config(again) == (longer, read_config(again)[1])
     assert find_checkpoint(config.run_dir) == again
+
+
+def test_random_draws_come_back_also_from_a_machine_with_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a run of a GPU that cannot go on without one, and draws that are not restored."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    random = RandomState()
+    state = {**random.state_dict(), "torch_cuda": [torch.zeros(16, dtype=torch.uint8)]}
+    drawn = torch.rand(4)
+    random.load_state_dict(state)
+    assert torch.equal(torch.rand(4), drawn)
+
+
+@pytest.mark.parametrize("device", ["cuda:99", "gpu"])
+def test_a_device_that_is_not_there_is_refused_in_one_line(config: TrainConfig, device: str) -> None:
+    """Catches a traceback from deep inside PyTorch, and a run folder that is left behind."""
+    with pytest.raises(UnavailableError, match=rf"device is '{device}' .*accepted: cpu") as caught:
+        train(config.replace(device=device))
+    assert "\n" not in str(caught.value)
+    assert not config.run_dir.exists()
+
+
+def test_the_environments_are_on_the_learners_device_where_they_can_be(config: TrainConfig) -> None:
+    """Catches PyBullet's worlds, or those of other processes, that are sought on a GPU."""
+    gpu = config.replace(device="cuda")
+    here = gpu.replace(simulator="planar", env=dataclasses.replace(config.env, simulator="planar"))
+    assert (here.env_device, gpu.env_device) == ("cuda", "cpu")
+    assert here.replace(num_workers=2).env_device == "cpu"
+    assert here.replace(backend="ray").env_device == "cpu"
 
 
 def test_a_finished_run_is_left_as_it_is(config: TrainConfig) -> None:
