@@ -8,49 +8,30 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from pathlib import Path
 from typing import Any
 
-from cura_torchrl.trainers.statistics import wilson_interval
+from cura_torchrl.trainers.statistics import paired_difference
 
 SIZES = (0.5, 0.75, 1.0)
 
 
-def difference(one: tuple[int, int], other: tuple[int, int]) -> tuple[float, float, float]:
-    """Return the difference of two rates with its 95 % interval, as if the episodes were not the same.
-
-    Args:
-        one: Successes and trials.
-        other: Successes and trials that the first are subtracted from.
-
-    Returns:
-        Difference, lower and upper bound [1].
-
-    Source:
-        Newcombe (1998), "Interval estimation for the difference between independent proportions", method 10.
-
-    Examples:
-        >>> [round(value, 3) for value in difference((48, 80), (56, 70))]
-        [0.2, 0.053, 0.334]
-    """
-    (rate_a, low_a, high_a), (rate_b, low_b, high_b) = ((k / n, *wilson_interval(k, n)) for k, n in (one, other))
-    middle = rate_b - rate_a
-    below = math.hypot(rate_b - low_b, high_a - rate_a)
-    above = math.hypot(high_b - rate_b, rate_a - low_a)
-    return middle, middle - below, middle + above
-
-
 def read(folder: Path) -> dict[tuple[str, str, int, float], dict[str, Any]]:
-    """Return the results of a folder by method, scenario, K and size."""
+    """Return the results of a folder that say how each scene ended, by method, scenario, K and size."""
     results = [json.loads(file.read_text(encoding="utf-8")) for file in sorted(folder.glob("*.json"))]
-    return {(r["method"], r["scenario"], r["max_obstacles"], r["object_size"]): r for r in results}
+    paired = [result for result in results if "outcomes" in result]
+    return {(r["method"], r["scenario"], r["max_obstacles"], r["object_size"]): r for r in paired}
 
 
-def row(name: str, one: tuple[int, int], other: tuple[int, int]) -> str:
-    """Return a row of the table: rates of both simulators and their difference in points."""
-    middle, low, high = (100 * value for value in difference(one, other))
-    rates = " | ".join(f"{100 * k / n:.1f} ({n})" for k, n in (one, other))
+def successes(results: list[dict[str, Any]]) -> list[bool]:
+    """Return whether each scene of some cells ended in success, cell by cell."""
+    return [letter == "s" for result in results for letter in result["outcomes"]]
+
+
+def row(name: str, one: list[bool], other: list[bool]) -> str:
+    """Return a row of the table: rates of both simulators, scene by scene, and their difference in points."""
+    middle, low, high = (100 * value for value in paired_difference(one, other))
+    rates = " | ".join(f"{100 * sum(own) / len(own):.1f} ({len(own)})" for own in (one, other))
     return f"| {name} | {rates} | {middle:+.1f} ({low:+.1f} to {high:+.1f}) |"
 
 
@@ -66,11 +47,8 @@ def main() -> None:
         for size in SIZES:
             keys = [key for key in shared if key[0] == method and key[3] == size]
             if keys:
-                sums = [
-                    (sum(r[key]["successes"] for key in keys), sum(r[key]["episodes"] for key in keys))
-                    for r in (bullet, planar)
-                ]
-                print(row(f"{method}, {size} m, {len(keys)} cells", *sums))
+                pair = (successes([results[key] for key in keys]) for results in (bullet, planar))
+                print(row(f"{method}, {size} m, {len(keys)} cells", *pair))
 
 
 if __name__ == "__main__":

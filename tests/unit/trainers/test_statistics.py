@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from cura_torchrl.trainers.statistics import area_under_roc, correlation, wilson_interval
+from cura_torchrl.trainers.statistics import area_under_roc, correlation, paired_difference, wilson_interval
 
 
 def test_wilson_interval_is_the_closed_form() -> None:
@@ -22,6 +22,40 @@ def test_wilson_interval_stays_within_0_and_1() -> None:
     assert wilson_interval(0, 20)[0] == pytest.approx(0.0, abs=1e-12)
     assert wilson_interval(20, 20)[1] == pytest.approx(1.0, abs=1e-12)
     assert wilson_interval(0, 0) == (0.0, 1.0)
+
+
+def trials(both: int, first: int, second: int, neither: int) -> tuple[list[int], list[int]]:
+    """Two sets of outcomes with these numbers of pairs."""
+    return [1] * (both + first) + [0] * (second + neither), [1] * both + [0] * first + [1] * second + [0] * neither
+
+
+def test_pairs_without_correlation_have_the_interval_of_independent_rates() -> None:
+    """Catches bounds that are joined the wrong way round.
+
+    40 of 50 after 30 of 50, phi = 0 (24 * 4 = 16 * 6). Wilson: 30 of 50 is 0.4618 to 0.7239, 40 of 50 is 0.6696 to
+    0.8876; so 0.2 - sqrt(0.1304^2 + 0.1239^2) and 0.2 + sqrt(0.0876^2 + 0.1382^2).
+    """
+    one, other = trials(24, 6, 16, 4)
+    assert paired_difference(one, other) == pytest.approx((0.2, 0.0201, 0.3636), abs=2e-4)
+
+
+def test_pairs_that_agree_narrow_the_interval_by_newcombes_phi() -> None:
+    """Catches the same data taken as independent.
+
+    43 pairs agree in success, 3 and 4 differ, 50 in neither: phi = (43 * 50 - 3 * 4 - 50) / sqrt(46 * 47 * 54 * 53)
+    = 0.8393; Wilson: 46 of 100 is 0.3656 to 0.5574, 47 of 100 is 0.3751 to 0.5671.
+    """
+    one, other = trials(43, 3, 4, 50)
+    down = math.sqrt(0.0949**2 - 2 * 0.8393 * 0.0949 * 0.0974 + 0.0974**2)
+    up = math.sqrt(0.0971**2 - 2 * 0.8393 * 0.0971 * 0.0944 + 0.0944**2)
+    assert paired_difference(one, other) == pytest.approx((0.01, 0.01 - down, 0.01 + up), abs=3e-4)
+
+
+def test_pairs_that_do_not_vary_and_sets_of_other_sizes() -> None:
+    """Catches a division by zero, and scenes that are paired with others."""
+    assert paired_difference([1] * 9, [1] * 9)[0] == 0.0
+    with pytest.raises(ValueError, match="9 and 8 trials; accepted: the same number"):
+        paired_difference([1] * 9, [1] * 8)
 
 
 def test_auroc_counts_pairs_and_ties_half() -> None:
