@@ -3,8 +3,8 @@
 # method sees. Run it again after an interruption, or with more frames: each run goes on from where it was.
 #   benchmarks/train_on_planar.sh RUNS FRAMES METHOD... [-- FLAG...]
 # FLAG... is handed to `cura-torchrl train`. ENCODER=<file> takes another encoder than the one that is shipped, SEED=<n> another seed,
-# NAME=<folder> another name than METHOD-SEED, START=<run> another start, WORKERS=<n> processes. benchmarks/training/map_vae.pt is the
-# encoder of both simulators' maps that the experiments in docs/research were run with, benchmarks/training/imitate-* the warm starts.
+# NAME=<folder> another name than METHOD-SEED, START=<run> another start, WORKERS=<n> processes, DEVICE=cuda the whole of it on a GPU.
+# benchmarks/training/map_vae.pt is the encoder of both simulators' maps, benchmarks/training/imitate-* are the warm starts.
 set -euo pipefail
 runs=$1 frames=$2
 shift 2
@@ -16,6 +16,11 @@ done
 [ $# -eq 0 ] || shift
 seed=${SEED:-0}
 encoder=(${ENCODER:+--encoder "$ENCODER"})
+if [ "${DEVICE:-cpu}" = cpu ]; then
+  where=(--device cpu --num-workers "${WORKERS:-2}")
+else
+  where=(--device "$DEVICE" --num-workers 1 --env.physics.planar-graph)
+fi
 export OMP_NUM_THREADS=1
 
 for method in "${methods[@]}"; do
@@ -30,11 +35,11 @@ for method in "${methods[@]}"; do
       --rounds 8 --steps 150 --epochs 15 --minibatch-size 2048
   fi
   if [ -d "$run/checkpoints" ]; then
-    cura-torchrl train --run-dir "$run" --total-frames "$frames" --resume
+    cura-torchrl train --run-dir "$run" --total-frames "$frames" --resume "${where[@]}"
   else
-    cura-torchrl train --method "$method" --simulator planar --num-envs 1024 --num-workers "${WORKERS:-2}" --total-frames "$frames" --seed "$seed" \
-      --run-dir "$run" --init-from "$start" "${encoder[@]}" --ppo.rollout-steps 24 --ppo.minibatch-size 6144 --ppo.lr 3e-4 \
-      --ppo.critic-warmup-frames 250000 --cura.costs-start-frames 250000 --ppo.entropy-coeff 0.001 --ppo.target-kl 0.02 \
+    cura-torchrl train --method "$method" --simulator planar "${where[@]}" --num-envs 4096 --total-frames "$frames" --seed "$seed" \
+      --run-dir "$run" --init-from "$start" "${encoder[@]}" --ppo.rollout-steps 12 --ppo.minibatch-size 8192 --ppo.lr 3e-4 \
+      --ppo.critic-warmup-frames 400000 --cura.costs-start-frames 400000 --ppo.entropy-coeff 0.001 --ppo.target-kl 0.02 \
       --network.min-std 0.15 --env.task.curriculum 0 6 "$@"
   fi
 done

@@ -52,7 +52,9 @@ class CURAAdvantage(TensorDictModuleBase):
 
     Apply it once per rollout, before the first gradient step: the costs and targets are those of the old estimator.
     With both coefficients at zero the advantage equals that of ``GAE(average_gae=True)`` to the last bit; set them to
-    zero until the estimator has been trained for a while. Like TorchRL's estimators it writes into its input.
+    zero until the estimator has been trained for a while. Like TorchRL's estimators it writes into its input. The
+    defaults are the letter of the paper; :class:`~cura_torchrl.trainers.config.CURAConfig` has those that train well on
+    the pushing task.
 
     Reads and writes (default keys), time being the last batch dimension:
 

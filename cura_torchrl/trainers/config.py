@@ -82,11 +82,15 @@ class PPOConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class CURAConfig:
-    """The collision estimator, and how its costs enter the policy's objective."""
+    """The collision estimator, and how its costs enter the policy's objective.
 
-    risk_coeff: float = 0.25
+    The paper's letter is ``risk_coeff`` 0.25, ``uncertainty_coeff`` 1, ``cost_baseline`` mean, ``advantage_scale`` raw;
+    docs/research/bravery.md has the measurements that the defaults follow.
+    """
+
+    risk_coeff: float = 0.0625
     """lambda_r, weight of the risk cost in the advantage [1]; 0 leaves it out."""
-    uncertainty_coeff: float = 1.0
+    uncertainty_coeff: float = 0.25
     """lambda_u, weight of the uncertainty cost in the advantage [1]; 0 leaves it out."""
     gamma: float = 0.9
     """gamma_c, discount of the collision per policy step [1]. Range: 0 to 1."""
@@ -103,9 +107,9 @@ class CURAConfig:
     cost_lmbda: float = 0.0
     """Lambda of an advantage estimate of the costs, which pays back later what was a cost at first [1]; 0 takes each
     step's own cost, as the paper does. Range: 0 to 1."""
-    cost_baseline: Literal["mean", "state"] = "mean"
+    cost_baseline: Literal["mean", "state"] = "state"
     """What costs are compared with: their mean (the paper), or what a linear regression on the observation predicts."""
-    advantage_scale: Literal["raw", "zscore"] = "raw"
+    advantage_scale: Literal["raw", "zscore"] = "zscore"
     """Scale of the advantage beside the costs: as it is (the paper), or brought to mean 0 and deviation 1 first."""
     normalise_sum: bool = True
     """Whether the advantage with its costs is brought to mean 0 and deviation 1 for the optimiser."""

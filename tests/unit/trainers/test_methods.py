@@ -20,16 +20,20 @@ PAPER = {
 
 
 @pytest.mark.parametrize(("name", "row"), PAPER.items())
-def test_a_preset_has_the_paper_s_occlusion_decay_and_coefficients(
+def test_a_preset_has_the_paper_s_occlusion_decay_and_share_of_the_costs(
     name: str, row: tuple[bool, float, float, float]
 ) -> None:
-    """Catches a method that is compared under another's settings."""
+    """Catches a method that is compared under another's settings.
+
+    The advantage is z-scored here, and the coefficients are a quarter of the paper's.
+    """
     config = method(name)
+    assert config.cura.advantage_scale == "zscore"
     assert (
         config.env.lidar.occlusion,
         config.map.decay,
-        config.cura.risk_coeff,
-        config.cura.uncertainty_coeff,
+        4.0 * config.cura.risk_coeff,
+        4.0 * config.cura.uncertainty_coeff,
     ) == row
     assert config.method == name
 
