@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from cura_torchrl.objectives.cura import CURALoss
 from cura_torchrl.objectives.cura_advantage import CURAAdvantage
+from cura_torchrl.objectives.energy import energy_distance
 from cura_torchrl.objectives.functional import (
-    energy_distance,
     normalise,
     risk_cost,
     sr_lambda_targets,

@@ -11,7 +11,7 @@ from tensordict.nn import dispatch
 from torchrl.objectives import ClipPPOLoss
 
 from cura_torchrl import keys
-from cura_torchrl.objectives.functional import energy_distance
+from cura_torchrl.objectives.energy import energy_distance
 
 if TYPE_CHECKING:
     import torch

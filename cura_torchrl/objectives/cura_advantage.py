@@ -11,9 +11,9 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torchrl.objectives.value import GAE
 
 from cura_torchrl import keys
+from cura_torchrl.objectives.energy import energy_distance
 from cura_torchrl.objectives.functional import (
     accumulate,
-    energy_distance,
     explain,
     masked_moments,
     normalise,

@@ -1,107 +1,14 @@
-"""Mathematics of CURA-PPO: energy distance, SR(lambda) targets, costs, normalisation. Tensors in, tensors out."""
+"""Mathematics of CURA-PPO: SR(lambda) targets, costs, normalisation. Tensors in, tensors out."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numpy as np
 import torch
-
-from cura_torchrl.compiled import compiled, run_rows
-
-if TYPE_CHECKING:
-    from cura_torchrl.compiled import Floats
-
 
 _RIDGE = 1e-6
 """Ridge of a regression beside features of deviation 1 [1]."""
 
 _MIN_SPREAD = 1e-9
 """Stands for the deviation of a feature that never changes."""
-
-
-def energy_distance(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Return the energy distance between two sets of atoms, exactly and without a tensor of all pairs.
-
-    With F and G the empirical distribution functions, 2 E|x - y| - E|x - x'| - E|y - y'| = 2 * integral (F - G)^2.
-    Between neighbouring merged atoms F - G is constant, so the integral is a sum over atoms with weights that depend on
-    their order alone. Gradients flow through that linear sum and are exact wherever no two atoms are equal.
-
-    Without the absolute values, which the paper's Eq. (6) leaves out, the distance would be unbounded below.
-
-    Args:
-        prediction: Atoms x in any order, shape ``[*B, N]``.
-        target: Atoms y in any order, shape ``[*B, M]``.
-
-    Returns:
-        Energy distance, in the units of the atoms, shape ``[*B]``; never negative but for rounding.
-
-    Raises:
-        ValueError: If the leading shapes differ or a set is empty.
-
-    Source:
-        Paper Eq. (6); Székely and Rizzo (2013), "Energy statistics".
-
-    Examples:
-        ``2 * (|0 - 1| + |2 - 1|) / 2 - (0 + 2 + 2 + 0) / 4 - 0 = 2 - 1 = 1``:
-
-        >>> energy_distance(torch.tensor([0.0, 2.0]), torch.tensor([1.0])).item()
-        1.0
-    """
-    num_x, num_y = prediction.shape[-1], target.shape[-1]
-    if prediction.shape[:-1] != target.shape[:-1] or num_x == 0 or num_y == 0:
-        msg = (
-            f"prediction has shape {tuple(prediction.shape)} and target {tuple(target.shape)}; "
-            "accepted: the same leading shape and at least one atom each"
-        )
-        raise ValueError(msg)
-    merged = torch.cat([prediction, target], -1)
-    # The weights sum to zero: moving the origin changes no value but avoids cancellation far from zero.
-    merged = merged - merged[..., :1].detach()
-    return (merged * _energy_weights(merged, num_x, num_y)).sum(-1)
-
-
-@torch.no_grad()
-def _energy_weights(merged: torch.Tensor, num_x: int, num_y: int) -> torch.Tensor:
-    if merged.device.type == "cpu" and not torch.compiler.is_compiling():
-        flat = merged.reshape(-1, merged.shape[-1]).contiguous()
-        weights = torch.empty_like(flat)
-        run_rows(_weigh_atoms, (weights, flat), num_x)
-        return weights.view_as(merged)
-    # 2 sum_k D_k^2 (z_(k+1) - z_k) = sum_k z_k * 2 (D_(k-1)^2 - D_k^2), where D_k is F - G just above sorted atom z_k.
-    # With the step s_k = D_k - D_(k-1), the weight is 2 s_k (s_k - 2 D_k).
-    order = merged.argsort(-1)
-    # Steps of N M (F - G): whole numbers, so that the sums are exact.
-    steps = torch.cat([merged.new_full((num_x,), num_y), merged.new_full((num_y,), -num_x)])
-    sorted_steps = steps.expand_as(merged).gather(-1, order)
-    sorted_weights = (sorted_steps - 2.0 * sorted_steps.cumsum(-1)) * sorted_steps * (2.0 / (num_x * num_y) ** 2)
-    return torch.empty_like(merged).scatter_(-1, order, sorted_weights)
-
-
-@compiled
-def _weigh_atoms(weights: Floats, merged: Floats, num_x: int) -> None:
-    # Up to a few hundred atoms, counting on all vector lanes is quicker than sorting. The derivative of E|x - y| by an
-    # atom of x is the share of y below it less the share above.
-    for n in range(merged.shape[0]):
-        x, y = merged[n, :num_x], merged[n, num_x:]
-        _weigh(weights[n, :num_x], x, y)
-        _weigh(weights[n, num_x:], y, x)
-
-
-@compiled
-def _weigh(weights: Floats, own: Floats, other: Floats) -> None:
-    for i in range(own.shape[0]):
-        share = _count_below(own[i], other) / other.shape[0] - _count_below(own[i], own) / own.shape[0]
-        weights[i] = share * (2.0 / own.shape[0])
-
-
-@compiled
-def _count_below(value: np.float32, atoms: Floats) -> np.int32:
-    """Return how many atoms are smaller, less how many are greater."""
-    count, one, none = np.int32(0), np.int32(1), np.int32(0)
-    for j in range(atoms.shape[0]):
-        count += (one if value > atoms[j] else none) - (one if value < atoms[j] else none)
-    return count
 
 
 def sr_lambda_targets(

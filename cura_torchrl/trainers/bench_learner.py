@@ -15,7 +15,7 @@ from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE
 from cura_torchrl.envs.push import ACTION_SIZE
 from cura_torchrl.modules import DistributionalCollisionEstimator, make_actor, make_critic
 from cura_torchrl.objectives import CURALoss
-from cura_torchrl.objectives.functional import energy_distance
+from cura_torchrl.objectives.energy import energy_distance
 from cura_torchrl.trainers.bench_report import Report, measure, rates, timed
 from cura_torchrl.trainers.build import LATENT_SIZE, Networks
 from cura_torchrl.trainers.learner import Learner
