@@ -1,4 +1,4 @@
-"""Print the cells that evaluate_on_bullet.sh wrote as Markdown: success [%], its interval, collisions, time-outs.
+"""Print the cells that evaluate_cells.sh wrote as Markdown: success [%], its interval, collisions, time-outs.
 
 python benchmarks/results_table.py benchmarks/results/bullet
 """

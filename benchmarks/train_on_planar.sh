@@ -4,7 +4,7 @@
 #   benchmarks/train_on_planar.sh RUNS FRAMES METHOD... [-- FLAG...]
 # FLAG... is handed to `cura-torchrl train`. ENCODER=<file> takes another encoder than the one that is shipped, SEED=<n> another seed,
 # NAME=<folder> another name than METHOD-SEED, START=<run> another start, WORKERS=<n> processes, DEVICE=cuda the whole of it on a GPU.
-# benchmarks/training/map_vae.pt is the encoder of both simulators' maps, benchmarks/training/imitate-* are the warm starts.
+# benchmarks/training/imitate-* are the warm starts that the shipped policies come from.
 set -euo pipefail
 runs=$1 frames=$2
 shift 2

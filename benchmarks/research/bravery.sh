@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Does it stay brave? One run without costs, then branches from it that differ in their costs alone, two at a time.
-#   ENCODER=benchmarks/training/map_vae.pt benchmarks/research/bravery.sh RUNS BASE_FRAMES BRANCH_FRAMES
+#   benchmarks/research/bravery.sh RUNS BASE_FRAMES BRANCH_FRAMES
 set -euo pipefail
 runs=$1 base=$2 frames=$3
 train=$(dirname "$0")/../train_on_planar.sh

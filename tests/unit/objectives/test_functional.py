@@ -50,7 +50,7 @@ def test_energy_distance_refuses_sets_that_do_not_fit() -> None:
 
 
 def test_energy_distance_compiles_into_one_graph() -> None:
-    """Catches a Python branch on data, which would break torch.compile's graph, and tensor operations that are wrong."""
+    """Catches a branch on data, which would break torch.compile's graph, and wrong tensor operations."""
     compiled = torch.compile(energy_distance, fullgraph=True, backend="eager")
     x, y = torch.rand(4, 6), torch.rand(4, 5)
     torch.testing.assert_close(compiled(x, y), energy_distance(x, y), rtol=0.0, atol=1e-6)
