@@ -1,5 +1,7 @@
 """Print the cells that evaluate_cells.sh wrote as Markdown: success [%], its interval, collisions, time-outs.
 
+Then what occlusion costs, and what CURA-PPO wins back on the same scenes.
+
 python benchmarks/results_table.py benchmarks/results/bullet
 """
 
@@ -7,10 +9,21 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections import defaultdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cura_torchrl.trainers.statistics import paired_difference
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 SIZES = (0.5, 0.75, 1.0)
+METHODS = ("push-no-occlusion", "push", "cura-ppo")
+BOOTSTRAP = 10_000
+"""Samples of the scenes [1]."""
 
 
 def cell(result: dict[str, Any] | None) -> str:
@@ -41,13 +54,64 @@ def table(results: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def successes(results: list[dict[str, Any]]) -> NDArray[np.bool_]:
+    """Return whether each scene of some cells ended in success, cell by cell.
+
+    Args:
+        results: What ``evaluate --json`` printed.
+    """
+    return np.array([letter == "s" for result in results for letter in result["outcomes"]])
+
+
+def share_interval(no_occlusion: NDArray[np.bool_], push: NDArray[np.bool_], method: NDArray[np.bool_]) -> list[float]:
+    """Return the share of the loss by occlusion that a method wins back, with its 95 % bootstrap interval over scenes.
+
+    Args:
+        no_occlusion: Successes of the policy whose object hides nothing, shape ``[M]``.
+        push: Those of the baseline on the same scenes, shape ``[M]``.
+        method: Those of the method, shape ``[M]``.
+
+    Returns:
+        (method - push) / (no occlusion - push), its lower and its upper bound [1].
+    """
+    rows = np.random.default_rng(0).integers(0, len(push), (BOOTSTRAP, len(push)))
+    won, lost = (which.astype(float) - push for which in (method, no_occlusion))
+    shares = won[rows].sum(1) / lost[rows].sum(1)
+    return [float(won.sum() / lost.sum()), *(float(bound) for bound in np.quantile(shares, (0.025, 0.975)))]
+
+
+def comparison(results: list[dict[str, Any]]) -> str:
+    """Return what occlusion costs and what CURA-PPO wins back, scene by scene, per cell and over all.
+
+    Args:
+        results: What ``evaluate --json`` printed; cells that not all three methods have played are left out.
+    """
+    played: dict[tuple[str, float], dict[str, dict[str, Any]]] = defaultdict(dict)
+    for result in results:
+        if result["method"] in METHODS and "outcomes" in result:
+            played[result["scenario"], result["object_size"]][result["method"]] = result
+    cells = {key: cell for key, cell in played.items() if len(cell) == len(METHODS)}
+    rows = {f"{scenario}, {size} m": [cell] for (scenario, size), cell in sorted(cells.items(), reverse=True)}
+    lines = ["| Cell (scenes) | lost by occlusion [points] | won back [points] |", "|---|---|---|"]
+    for name, group in {**rows, "all": list(cells.values())}.items():
+        free, push, cura = (successes([cell[method] for cell in group]) for method in METHODS)
+        gains = (paired_difference(push, other) for other in (free, cura))
+        shown = [f"{100 * middle:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})" for middle, low, high in gains]
+        lines.append(f"| {name} ({len(push)}) | {' | '.join(shown)} |")
+    free, push, cura = (successes([cell[method] for cell in cells.values()]) for method in METHODS)
+    share = ", ".join(f"{value:.2f}" for value in share_interval(free, push, cura))
+    return "\n".join(
+        [*lines, "", f"Share of the loss won back over all cells, and its 95 % bootstrap interval: {share}."]
+    )
+
+
 def main() -> None:
     """Parse the command line and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder of JSON files")
     folder = parser.parse_args().folder
     results = [json.loads(file.read_text(encoding="utf-8")) for file in sorted(folder.glob("*.json"))]
-    print(table(results))
+    print(table(results) + "\n\n" + comparison(results))
     print(f"\n{len(results)} cells; in each cell: success [%] (95 % interval), collisions / time-outs.")
 
 

@@ -44,19 +44,8 @@ def mark_free(
         [1.0, 1.0, 0.0]
     """
     for rows in _chunks(stamps):
-        _stamp(stamps[rows], steps[rows], axes, scan[rows], sensor_pose[rows], margin)
-
-
-def _stamp(
-    stamps: torch.Tensor,
-    steps: torch.Tensor,
-    axes: tuple[torch.Tensor, torch.Tensor],
-    scan: torch.Tensor,
-    sensor_pose: torch.Tensor,
-    margin: float,
-) -> None:
-    free = visibility.seen_free(*axes, scan, sensor_pose, margin)
-    stamps.copy_(torch.where(free, steps[:, None, None], stamps))
+        free = visibility.seen_free(*axes, scan[rows], sensor_pose[rows], margin)
+        stamps[rows] = torch.where(free, steps[rows, None, None], stamps[rows])
 
 
 def mark_hits(
