@@ -10,7 +10,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import gymnasium
+import numpy as np
 import pytest
+from torchrl.envs import check_env_specs
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -18,6 +21,7 @@ if TYPE_CHECKING:
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 TRAINING = [path for path in EXAMPLES if path.stem != "confidence_map_elsewhere"]
 REACHED = {
+    "cura_on_gymnasium": r"last \d+ episodes: return (\S+) of at most 200, (\S+)% ended by spinning too fast",
     "plain_ppo": r"reward a step: (\S+) in the first rollout, (\S+) in the last",
     "train_in_a_loop": r"reward (\S+) a step, collisions (\S+)% of steps",
 }
@@ -55,3 +59,34 @@ def test_example_trains(script: Path, tmp_path: Path) -> None:
 def test_examples_stay_short(script: Path) -> None:
     """Catches an example that has outgrown what a stranger reads in a minute."""
     assert len(script.read_text(encoding="utf-8").splitlines()) <= 120
+
+
+class TestSpeedLimit:
+    """The task of ``cura_on_gymnasium``."""
+
+    @pytest.mark.parametrize(("speed", "is_fast"), [(5.9, False), (6.2, True), (-6.2, True)])
+    def test_costs_and_ends_where_the_pendulum_spins_too_fast(self, speed: float, is_fast: bool) -> None:
+        """Catches a cost without an end, an end without a cost, and a limit in one direction only."""
+        env = _load("cura_on_gymnasium").SpeedLimit(gymnasium.make("Pendulum-v1"))
+        _, info = env.reset(seed=0)
+        assert info["cost"].tolist() == [0.0]
+        env.unwrapped.state = np.array([0.0, speed])  # upright: gravity does not change the speed
+        _, _, terminated, truncated, info = env.step(np.zeros(1, dtype=np.float32))
+        assert (info["cost"].tolist(), terminated, truncated) == ([float(is_fast)], is_fast, False)
+
+    def test_scales_the_reward_to_be_worth_living_for(self) -> None:
+        """Catches a reward below zero, for which an early end would be a gain."""
+        env = _load("cura_on_gymnasium").SpeedLimit(gymnasium.make("Pendulum-v1"))
+        env.reset(seed=0)
+        env.unwrapped.state = np.array([0.0, 0.0])
+        assert env.step(np.zeros(1, dtype=np.float32))[1] == pytest.approx(1.0)
+        env.unwrapped.state = np.array([math.pi / 2, 4.0])
+        # -(pi / 2)^2 - 0.1 * 4^2 - 0.001 * 2^2 = -4.0714; 1 - 4.0714 / 16.3 = 0.75022
+        assert env.step(np.full(1, 2.0, dtype=np.float32))[1] == pytest.approx(0.75022, abs=1e-4)
+
+    def test_hands_the_cost_to_torchrl(self) -> None:
+        """Catches a cost that is lost between the info and the rollout, or has another shape than the reward."""
+        env = _load("cura_on_gymnasium").make_task()
+        check_env_specs(env)
+        rollout = env.rollout(5)
+        assert rollout["next", "cost"].shape == rollout["next", "reward"].shape == (5, 1)
