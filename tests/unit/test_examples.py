@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING
 import gymnasium
 import numpy as np
 import pytest
+import torch
+from matplotlib.image import imread
+from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
 if TYPE_CHECKING:
@@ -61,6 +64,22 @@ def test_examples_stay_short(script: Path) -> None:
     assert len(script.read_text(encoding="utf-8").splitlines()) <= 120
 
 
+def test_the_map_elsewhere_shows_the_pillars(tmp_path: Path) -> None:
+    """Catches a map of which bearings or axes are mistaken: its occupied cells would not lie on the pillars."""
+    script = next(path for path in EXAMPLES if path.stem == "confidence_map_elsewhere")
+    done = _run(script, tmp_path, "--num-envs", "2", "--steps", "20", "--output", "map.png")
+    line = r"map\.png: (\d+)% seen of late; (\d+) occupied cells, (\S+) m from a pillar's edge"
+    found = re.fullmatch(line, done.stdout.strip())
+    assert found is not None, done.stdout
+    seen, cells, distance = map(float, found.groups())
+    # Pillars hide some of the window and leave most of it; cells are 0.1 m wide and turned into the window's grid.
+    assert 20 < seen < 95
+    assert cells > 20
+    assert distance < 0.1
+    picture = imread(tmp_path / "map.png")
+    assert picture.std() > 0.1  # not blank
+
+
 class TestSpeedLimit:
     """The task of ``cura_on_gymnasium``."""
 
@@ -90,3 +109,31 @@ class TestSpeedLimit:
         check_env_specs(env)
         rollout = env.rollout(5)
         assert rollout["next", "cost"].shape == rollout["next", "reward"].shape == (5, 1)
+
+
+class TestPillars:
+    """The worlds of ``confidence_map_elsewhere``."""
+
+    def test_ranges_are_those_of_circles(self) -> None:
+        """Catches rays that count from elsewhere, turn the other way, or see through the robot's back."""
+        example = _load("confidence_map_elsewhere")
+        # The robot at (1, 0) looks along y: a pillar at (1, 2) is 2 m ahead, one at (-1, 0) is 2 m to the left.
+        pose = torch.tensor([[1.0, 0.0, math.pi / 2]])
+        centres = example.relative(torch.tensor([[[1.0, 2.0], [-1.0, 0.0]]]), pose)
+        assert torch.allclose(centres, torch.tensor([[[2.0, 0.0], [0.0, 2.0]]]), atol=1e-6)
+        ranges = example.cast(centres)[0]
+        # From straight behind, counter-clockwise, 180 rays: behind, right, ahead, left. The radius is 0.3 m.
+        assert ranges[[0, 45, 90, 135]].tolist() == pytest.approx([4.0, 4.0, 1.7, 1.7], abs=1e-5)
+
+    def test_are_an_environment(self) -> None:
+        """Catches specs that differ from the data, and a reset of one world that moves the others."""
+        worlds = _load("confidence_map_elsewhere").PillarWorlds(2)
+        check_env_specs(worlds)
+        state = worlds.reset()
+        state = worlds.step(state.set("action", torch.ones(2, 2)))["next"]
+        # One step of 0.2 s: yaw 0.2, then 0.2 m along it: x = 0.2 * cos(0.2) = 0.19601, y = 0.2 * sin(0.2) = 0.03973.
+        assert state["robot", "odometry"][0].tolist() == pytest.approx([0.19601, 0.03973, 0.2], abs=1e-5)
+        before = worlds.pillars.clone()
+        worlds.reset(TensorDict(_reset=torch.tensor([[True], [False]]), batch_size=[2]))
+        assert worlds.pose[:, 0].tolist() == pytest.approx([0.0, 0.19601], abs=1e-5)
+        assert (worlds.pillars != before).any(-1).any(-1).tolist() == [True, False]
