@@ -16,7 +16,7 @@ import pytest
 import torch
 from matplotlib.image import imread
 from tensordict import TensorDict
-from torchrl.envs import check_env_specs
+from torchrl.envs import TransformedEnv, check_env_specs
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 TRAINING = [path for path in EXAMPLES if path.stem != "confidence_map_elsewhere"]
 REACHED = {
+    "a_method_of_ones_own": r"last rollout: reward (\S+) a step, bonus (\S+), collisions (\S+)% of steps",
     "cura_on_gymnasium": r"last \d+ episodes: return (\S+) of at most 200, (\S+)% ended by spinning too fast",
     "plain_ppo": r"reward a step: (\S+) in the first rollout, (\S+) in the last",
     "train_in_a_loop": r"reward (\S+) a step, collisions (\S+)% of steps",
@@ -137,3 +138,39 @@ class TestPillars:
         worlds.reset(TensorDict(_reset=torch.tensor([[True], [False]]), batch_size=[2]))
         assert worlds.pose[:, 0].tolist() == pytest.approx([0.0, 0.19601], abs=1e-5)
         assert (worlds.pillars != before).any(-1).any(-1).tolist() == [True, False]
+
+
+class TestMapEntropy:
+    """The method of ``a_method_of_ones_own``."""
+
+    def test_entropy_is_that_of_the_cells_ahead(self) -> None:
+        """Catches cells behind or beside that count, a wrong channel, and another unit than the bit."""
+        entropy_ahead = _load("a_method_of_ones_own").entropy_ahead
+        window = torch.zeros(1, 2, 4, 4)
+        window[:, 1] = 1.0  # what is occupied makes no difference
+        assert entropy_ahead(window, 1).tolist() == [[1.0]]  # nothing seen: one bit a cell
+        window[:, 0, :2] = 1.0  # behind
+        window[:, 0, :, [0, 3]] = 1.0  # aside
+        assert entropy_ahead(window, 1).tolist() == [[1.0]]
+        # Ahead are the rows 2, 3 of the columns 1, 2. Confidence 1, 1, 0.5, 0: bits 0, 0, h(3/4), 1, where
+        # h(3/4) = 3/4 log2(4/3) + 1/4 log2(4) = 0.31128 + 0.5 = 0.81128; the mean is 1.81128 / 4 = 0.45282.
+        window[0, 0, 2:, 1:3] = torch.tensor([[1.0, 1.0], [0.5, 0.0]])
+        assert entropy_ahead(window, 1).item() == pytest.approx(0.45282, abs=1e-5)
+
+    def test_bonus_is_added_to_the_reward_of_a_step(self) -> None:
+        """Catches a bonus for not knowing, one that replaces the task's reward, and one without its coefficient."""
+        transform = _load("a_method_of_ones_own").MapEntropyBonus(2.0, half_width=1)
+        maps = torch.stack([torch.zeros(2, 4, 4), torch.ones(2, 4, 4)])
+        data = TensorDict(confidence_map=maps, reward=torch.full((2, 1), 3.0), batch_size=[2])
+        # Nothing known: 3 + 2 * 0; all known: 3 + 2 * 1.
+        assert transform._call(data)["reward"].tolist() == [[3.0], [5.0]]
+
+    def test_environment_pays_it_and_removes_the_map(self) -> None:
+        """Catches a transform behind the encoder, where the map is gone, and a map that the collector would carry."""
+        env = _load("a_method_of_ones_own").make_env(2, 2.0)
+        assert isinstance(env, TransformedEnv)
+        check_env_specs(env)
+        rollout = env.rollout(3, break_when_any_done=False)
+        assert "confidence_map" not in rollout["next"]
+        bonus = rollout["next", "reward"] - rollout["next", "reward_terms"].sum(-1, keepdim=True)
+        assert bool(((bonus > 0.0) & (bonus <= 2.0)).all())
