@@ -1,9 +1,11 @@
 """CURA-PPO on an ordinary Gymnasium task: a pendulum that must swing up and must not spin too fast.
 
 Nothing here knows of robots, scans or maps. The task's info carries a ``cost``, and every part reads the observation
-under the key that TorchRL's ``GymWrapper`` gives it. With the defaults (seed 0, 122,880 steps, one minute on one core)
-the share of episodes that end by spinning too fast falls from 64 % after three rollouts to 8 %, and the return rises
-from 51 to 173 of at most 200.
+under the key that TorchRL's ``GymWrapper`` gives it. Needs gymnasium (``pip install gymnasium``).
+
+With the defaults (seed 0, 122,880 steps, one minute on one core) the share of episodes that end by spinning too fast
+falls from 64 % after three rollouts to 8 %, and the return rises from 51 to 173 of at most 200. With both coefficients
+at 0, which is plain PPO, it is 4 % and 179: a pendulum hides nothing, so this shows the wiring and no gain.
 
 python examples/cura_on_gymnasium.py
 """
