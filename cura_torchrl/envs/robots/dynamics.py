@@ -8,7 +8,8 @@ from xml.etree import ElementTree
 import pytorch_kinematics as pk
 import torch
 
-from cura_torchrl.envs.robots.ridgeback_franka import ARM_LINKS, BASE_LINK, TCP_LINK, URDF
+from cura_torchrl.envs.robots.kinematics import ArmKinematics
+from cura_torchrl.envs.robots.ridgeback_franka import ARM_LINKS, BASE_LINK, BASE_LINK_HEIGHT, URDF
 
 
 @dataclass(frozen=True)
@@ -51,11 +52,11 @@ class RobotDynamics:
     """
 
     def __init__(self, device: torch.device | None = None) -> None:
-        urdf = URDF.read_bytes()
-        chain = pk.build_serial_chain_from_urdf(urdf, TCP_LINK, root_link_name=BASE_LINK)
-        self._chain = chain.to(dtype=torch.float64, device=device)
-        self._links = self._chain.get_frame_indices(*ARM_LINKS).to(device)
-        masses = _rigid_groups(ElementTree.fromstring(urdf))
+        self._kinematics = ArmKinematics(device)
+        masses = _rigid_groups(ElementTree.fromstring(URDF.read_bytes()))
+        # About the ground below the base's centre, as the arm's links.
+        height = torch.tensor([0.0, 0.0, BASE_LINK_HEIGHT], dtype=torch.float64)
+        masses[BASE_LINK] = masses[BASE_LINK].moved(torch.eye(3, dtype=torch.float64), height)
 
         def stack(links: tuple[str, ...]) -> _Inertia:
             parts = [masses[link] for link in links]
@@ -81,8 +82,8 @@ class RobotDynamics:
             Featherstone (2008), "Rigid Body Dynamics Algorithms", section 6.2: the composite-rigid-body algorithm, all
             in one frame.
         """
-        frames = self._chain.forward_kinematics_tensor(joint_position[:, 3:])[self._links].movedim(0, 1)
-        rotation, position = frames[..., :3, :3], frames[..., :3, 3]
+        links = self._kinematics.links(joint_position[:, 3:])
+        rotation, position = links[..., :3], links[..., 3]
         bodies = self._arm.moved(rotation, position)
         # What each joint carries: all links from its own to the hand; the base's joints carry those and the base.
         carried = [_from_the_tip(part) for part in (bodies.mass, bodies.moment, bodies.tensor)]

@@ -90,11 +90,9 @@ def place_hand(joints: Doubles, offsets: Doubles, pose: Doubles, jacobian: Doubl
     """
     pose[:] = offsets[0]
     for j in range(_ARM_DOF):
-        cos, sin = math.cos(joints[j]), math.sin(joints[j])
         for i in range(3):
-            x, y = pose[i, 0], pose[i, 1]
-            pose[i, 0], pose[i, 1] = cos * x + sin * y, cos * y - sin * x
             jacobian[i, j], jacobian[3 + i, j] = pose[i, 3], pose[i, 2]
+        _turn(pose, joints[j])
         _attach(pose, offsets[j + 1])
     for j in range(_ARM_DOF):
         x, y, z = pose[0, 3] - jacobian[0, j], pose[1, 3] - jacobian[1, j], pose[2, 3] - jacobian[2, j]
@@ -102,6 +100,32 @@ def place_hand(joints: Doubles, offsets: Doubles, pose: Doubles, jacobian: Doubl
         jacobian[0, j] = axis[1] * z - axis[2] * y
         jacobian[1, j] = axis[2] * x - axis[0] * z
         jacobian[2, j] = axis[0] * y - axis[1] * x
+
+
+@compiled
+def place_links(joints: Doubles, poses: Doubles, offsets: Doubles) -> None:
+    """Work out where the links of many robots are, as ``ArmKinematics.links`` does.
+
+    Args:
+        joints: Arm joints [rad], shape ``[N, 7]``.
+        poses: Where the links' rotations and positions [m] go, shape ``[N, 7, 3, 4]``.
+        offsets: As in :func:`rates_of_one`.
+    """
+    pose = np.empty((3, 4))
+    for n in range(joints.shape[0]):
+        pose[:] = offsets[0]
+        for j in range(_ARM_DOF):
+            _turn(pose, joints[n, j])
+            poses[n, j] = pose
+            _attach(pose, offsets[j + 1])
+
+
+@compiled
+def _turn(pose: Doubles, angle: float) -> None:
+    cos, sin = math.cos(angle), math.sin(angle)
+    for i in range(3):
+        x, y = pose[i, 0], pose[i, 1]
+        pose[i, 0], pose[i, 1] = cos * x + sin * y, cos * y - sin * x
 
 
 @compiled

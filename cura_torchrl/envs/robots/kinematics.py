@@ -10,7 +10,7 @@ import pytorch_kinematics as pk
 import torch
 
 from cura_torchrl.envs import geometry
-from cura_torchrl.envs.robots.ik_kernel import place_hands
+from cura_torchrl.envs.robots.ik_kernel import place_hands, place_links
 from cura_torchrl.envs.robots.ridgeback_franka import ARM_LINKS, BASE_LINK, BASE_LINK_HEIGHT, TCP_LINK, URDF
 
 
@@ -37,6 +37,7 @@ class ArmKinematics:
         poses = self._chain.forward_kinematics(self._chain.axes.new_zeros(1, 7), end_only=False)
         frames = torch.cat([poses[link].get_matrix() for link in (*ARM_LINKS, TCP_LINK)]).cpu()
         frames[:, 2, 3] += BASE_LINK_HEIGHT
+        self._links = self._chain.get_frame_indices(*ARM_LINKS).to(device)
         frames[1:] = torch.linalg.solve(frames[:-1], frames[1:])
         self.offsets = frames[:, :3].contiguous()
 
@@ -59,6 +60,24 @@ class ArmKinematics:
         position = pose[:, :3, 3].clone()
         position[:, 2] += BASE_LINK_HEIGHT
         return position, pose[:, :3, :3], jacobian
+
+
+    def links(self, joint_position: torch.Tensor) -> torch.Tensor:
+        """Return where the links are that the joints move.
+
+        Args:
+            joint_position: Arm joints [rad], float64, shape ``[N, 7]``.
+
+        Returns:
+            Rotations and positions [m] of the links' frames in the base frame, shape ``[N, 7, 3, 4]``.
+        """
+        if joint_position.device.type == "cpu":
+            poses = joint_position.new_empty(len(joint_position), len(ARM_LINKS), 3, 4)
+            place_links(joint_position.contiguous().numpy(), poses.numpy(), self.offsets.numpy())
+            return poses
+        poses = self._chain.forward_kinematics_tensor(joint_position)[self._links, :, :3].movedim(0, 1)
+        poses[..., 2, 3] += BASE_LINK_HEIGHT
+        return poses
 
 
 def damped_least_squares(

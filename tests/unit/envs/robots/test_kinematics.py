@@ -57,3 +57,13 @@ def test_the_compiled_kinematics_are_those_of_the_chain():
     # The base frame is on the ground, the chain's root 0.026 m above it.
     pose[:, 2, 3] += 0.026
     torch.testing.assert_close(position, pose[:, :3, 3], rtol=0.0, atol=1e-12)
+
+
+def test_the_compiled_links_are_those_of_the_chain():
+    """Catches a frame before its joint has turned, or that of the link after it."""
+    arm = ArmKinematics()
+    joints = 6.0 * torch.rand(9, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 3.0
+    poses = arm._chain.forward_kinematics(joints, end_only=False)
+    expected = torch.stack([poses[f"panda_link{i}"].get_matrix()[:, :3] for i in range(1, 8)], dim=1)
+    expected[..., 2, 3] += 0.026  # the base frame is on the ground, the chain's root 0.026 m above it
+    torch.testing.assert_close(arm.links(joints), expected, rtol=0.0, atol=1e-12)
