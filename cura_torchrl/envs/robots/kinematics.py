@@ -61,7 +61,6 @@ class ArmKinematics:
         position[:, 2] += BASE_LINK_HEIGHT
         return position, pose[:, :3, :3], jacobian
 
-
     def links(self, joint_position: torch.Tensor) -> torch.Tensor:
         """Return where the links are that the joints move.
 
