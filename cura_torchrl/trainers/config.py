@@ -82,16 +82,12 @@ class PPOConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class CURAConfig:
-    """The collision estimator, and how its costs enter the policy's objective.
-
-    The paper's letter is ``risk_coeff`` 0.25, ``uncertainty_coeff`` 1, ``cost_baseline`` mean, ``advantage_scale`` raw;
-    docs/research/bravery.md has the measurements that the defaults follow.
-    """
+    """The collision estimator, and how its costs enter the policy's objective."""
 
     risk_coeff: float = 0.0625
-    """lambda_r, weight of the risk cost in the advantage [1]; 0 leaves it out."""
+    """lambda_r, weight of the risk cost in the advantage [1]; 0 leaves it out. The paper has 0.25 beside a raw one."""
     uncertainty_coeff: float = 0.25
-    """lambda_u, weight of the uncertainty cost in the advantage [1]; 0 leaves it out."""
+    """lambda_u, weight of the uncertainty cost in the advantage [1]; 0 leaves it out. The paper has 1."""
     gamma: float = 0.9
     """gamma_c, discount of the collision per policy step [1]. Range: 0 to 1."""
     lmbda: float = 0.95
