@@ -17,14 +17,12 @@ from cura_torchrl.envs import geometry
 from cura_torchrl.envs.robots import ridgeback_franka as model
 from cura_torchrl.envs.robots.ik_kernel import Follow, rates_of_one
 from cura_torchrl.envs.robots.kinematics import ArmKinematics, damped_least_squares
+from cura_torchrl.envs.robots.ridgeback_franka import BASE_DOF, DOF
 from cura_torchrl.envs.robots.torque_kernel import torques_of_one
 from cura_torchrl.envs.simulation.interface import HandLinearization
 
 if TYPE_CHECKING:
     from cura_torchrl.envs.config import RobotConfig
-
-BASE_DOF = len(model.BASE_JOINTS)
-DOF = BASE_DOF + len(model.ARM_JOINTS)
 
 
 class ImpedanceController:

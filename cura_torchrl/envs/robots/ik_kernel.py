@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cura_torchrl.compiled import Doubles, compiled
-
-_BASE_DOF, _ARM_DOF = 3, 7
+from cura_torchrl.envs.robots.ridgeback_franka import ARM_DOF, BASE_DOF
 
 
 class Follow(NamedTuple):
@@ -46,19 +45,19 @@ def rates_of_one(
         postures: Home posture [rad] and largest rate [rad/s] of the joints, shape ``[2, 7]``.
         follow: Gains and limits.
     """
-    joints, rates, aim = motions[world, 0, _BASE_DOF:], motions[world, 1, _BASE_DOF:], aims[world]
-    pose, jacobian, task = np.empty((3, 4)), np.empty((6, _ARM_DOF)), np.empty(6)
+    joints, rates, aim = motions[world, 0, BASE_DOF:], motions[world, 1, BASE_DOF:], aims[world]
+    pose, jacobian, task = np.empty((3, 4)), np.empty((6, ARM_DOF)), np.empty(6)
     place_hand(joints, offsets, pose, jacobian)
     for i in range(3):
         _follow_tcp(i, tcp_references[world], pose[i, 3], aim[i], workspaces[world, i], follow, task)
     _face(pose, aim[3] - pose[0, 3], aim[4] - pose[1, 3], follow, task)
     # v = p + J^T (J J^T + lambda^2 I)^-1 (t - J p): the twist t, and the posture p in what it leaves free.
-    for j in range(_ARM_DOF):
+    for j in range(ARM_DOF):
         rates[j] = follow.posture_gain * (postures[0, j] - joints[j])
         for i in range(6):
             task[i] -= jacobian[i, j] * rates[j]
     _solve_damped(jacobian, follow.ik_damping, task)
-    for j in range(_ARM_DOF):
+    for j in range(ARM_DOF):
         for i in range(6):
             rates[j] += jacobian[i, j] * task[i]
         rates[j] = min(max(rates[j], -postures[1, j]), postures[1, j])
@@ -89,12 +88,12 @@ def place_hand(joints: Doubles, offsets: Doubles, pose: Doubles, jacobian: Doubl
         jacobian: Where the Jacobian goes [m/rad, 1], shape ``[6, 7]``.
     """
     pose[:] = offsets[0]
-    for j in range(_ARM_DOF):
+    for j in range(ARM_DOF):
         for i in range(3):
             jacobian[i, j], jacobian[3 + i, j] = pose[i, 3], pose[i, 2]
         _turn(pose, joints[j])
         _attach(pose, offsets[j + 1])
-    for j in range(_ARM_DOF):
+    for j in range(ARM_DOF):
         x, y, z = pose[0, 3] - jacobian[0, j], pose[1, 3] - jacobian[1, j], pose[2, 3] - jacobian[2, j]
         axis = jacobian[3:, j]
         jacobian[0, j] = axis[1] * z - axis[2] * y
@@ -114,7 +113,7 @@ def place_links(joints: Doubles, poses: Doubles, offsets: Doubles) -> None:
     pose = np.empty((3, 4))
     for n in range(joints.shape[0]):
         pose[:] = offsets[0]
-        for j in range(_ARM_DOF):
+        for j in range(ARM_DOF):
             _turn(pose, joints[n, j])
             poses[n, j] = pose
             _attach(pose, offsets[j + 1])

@@ -15,6 +15,9 @@ BASE_JOINTS = ("base_x", "base_y", "base_yaw")
 ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 """The arm's seven revolute joints."""
 
+BASE_DOF, ARM_DOF = len(BASE_JOINTS), len(ARM_JOINTS)
+DOF = BASE_DOF + ARM_DOF
+
 ARM_LINKS = tuple(name.replace("joint", "link") for name in ARM_JOINTS)
 """The links that they move."""
 

@@ -7,8 +7,7 @@ import math
 import numpy as np
 
 from cura_torchrl.compiled import Doubles, compiled
-
-_BASE_DOF = 3
+from cura_torchrl.envs.robots.ridgeback_franka import BASE_DOF
 
 
 @compiled
@@ -39,7 +38,7 @@ def torques_of_one(
     force[0] = damping[0] * (cos * state[0] - sin * state[1] - velocity[0])
     force[1] = damping[1] * (sin * state[0] + cos * state[1] - velocity[1])
     force[2] = damping[2] * (state[2] - velocity[2])
-    for j in range(_BASE_DOF, len(force)):
+    for j in range(BASE_DOF, len(force)):
         drag = damping[j] * velocity[j]
         centre, reach = position[j] + drag / stiffness[j], limit[j] / stiffness[j]
         reference = max(state[j] + target[j] * period, constants[3, j], centre - reach)
@@ -49,7 +48,7 @@ def torques_of_one(
         total = 0.0
         for j in range(len(force)):
             total += gain[i, j] * force[j]
-        torque[i] = total if i < _BASE_DOF else min(max(total, -limit[i]), limit[i])
+        torque[i] = total if i < BASE_DOF else min(max(total, -limit[i]), limit[i])
 
 
 @compiled

@@ -13,13 +13,13 @@ import torch
 from tensordict import TensorDictBase, unravel_key
 from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import Transform
-from torchrl.envs.transforms.utils import _get_reset
 
 from cura_torchrl import keys
 from cura_torchrl.envs.config import MapConfig, require
 from cura_torchrl.envs.sensors import map_kernels, map_tensors, visibility, window
 from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.envs.sensors.visibility import MapGrid
+from cura_torchrl.envs.transforms.reset_mask import reset_mask
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -168,7 +168,7 @@ class ConfidenceMap(Transform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         inputs = self._read(tensordict_reset)
         num_rows, device = inputs[0].shape[0], inputs[0].device
-        mask = _get_reset(self._reset_key(), tensordict).expand(self._batch_shape).reshape(-1)
+        mask = reset_mask(self, tensordict).expand(self._batch_shape).reshape(-1)
         if len(self._stamps) != num_rows or self._stamps.device != device:
             require(bool(mask.all()), "reset mask", mask.tolist(), "a whole reset where the batch or the device is new")
             self._stamps = torch.zeros(num_rows, *self._stamps.shape[1:], device=device)
@@ -243,11 +243,6 @@ class ConfidenceMap(Transform):
     def _write(self, tensordict: TensorDictBase, window: torch.Tensor) -> TensorDictBase:
         tensordict.set(self.out_keys[0], window.view(*self._batch_shape, *window.shape[1:]))
         return tensordict
-
-    def _reset_key(self) -> NestedKey:
-        reset_keys = ["_reset"] if self.parent is None else self.parent.reset_keys
-        require(len(reset_keys) == 1, "reset keys", reset_keys, "environments with one done flag per row")
-        return reset_keys[0]
 
 
 def _decay_powers(decay: float) -> torch.Tensor:

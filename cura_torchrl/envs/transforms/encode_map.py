@@ -8,10 +8,9 @@ import torch
 from tensordict import TensorDictBase, unravel_key
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
-from torchrl.envs.transforms.utils import _get_reset
 
 from cura_torchrl import keys
-from cura_torchrl.envs.config import require
+from cura_torchrl.envs.transforms.reset_mask import reset_mask
 
 if TYPE_CHECKING:
     from tensordict import NestedKey
@@ -92,7 +91,7 @@ class EncodeMap(Transform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         maps = self._read(tensordict_reset)
-        mask = _get_reset(self._reset_key(), tensordict).expand(maps.shape[:-3])
+        mask = reset_mask(self, tensordict).expand(maps.shape[:-3])
         fresh = self._encode(maps[mask])
         codes = fresh.new_zeros(*mask.shape, fresh.shape[-1])
         codes[mask] = fresh
@@ -137,8 +136,3 @@ class EncodeMap(Transform):
     def _write(self, tensordict: TensorDictBase, codes: torch.Tensor) -> TensorDictBase:
         tensordict.set(self.out_keys[0], codes)
         return tensordict.exclude(*self.in_keys, inplace=True) if self.del_keys else tensordict
-
-    def _reset_key(self) -> NestedKey:
-        reset_keys = ["_reset"] if self.parent is None else self.parent.reset_keys
-        require(len(reset_keys) == 1, "reset keys", reset_keys, "environments with one done flag per row")
-        return reset_keys[0]
