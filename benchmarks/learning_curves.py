@@ -85,7 +85,8 @@ def main() -> None:
             axis.set_ylim(0.0, 1.0)
     for axis in axes[-1]:
         axis.set_xlabel("environment steps [million]")
-    axes.flat[0].legend()
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 6), fontsize=8)
     figure.savefig(options.output, dpi=110)
     if options.summary is not None:
         options.summary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
