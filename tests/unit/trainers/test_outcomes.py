@@ -91,6 +91,8 @@ def test_other_weights_are_refused(tmp_path: Path) -> None:
         (lambda data: b"no database" * 400, "is damaged: file is not a database"),
         (lambda data: data[:4096] + bytes(len(data) - 4096), "is damaged: "),
         (lambda data: data[: len(data) // 2], "is damaged: "),
+        (lambda data: data[:-4096] + bytes(4096), "is damaged: "),
+        (lambda data: data.replace(b"planaruniform", b"zlanaruniform", 1), "is damaged: "),
     ],
 )
 def test_a_damaged_file_is_refused_in_one_line(damage: object, message: str, tmp_path: Path) -> None:

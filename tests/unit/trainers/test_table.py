@@ -107,6 +107,16 @@ def test_a_run_that_was_broken_off_ends_with_the_same_table(tmp_path: Path, monk
         assert (tmp_path / "broken" / name).read_text() == (tmp_path / "whole" / name).read_text()
 
 
+def test_a_part_that_was_played_for_fewer_scenes_is_completed(tmp_path: Path) -> None:
+    """Catches scenes that stay unplayed because others of their part are there, and a table of all that is found."""
+    untrained(tmp_path, "push", 0)
+    few = table(tiny(tmp_path, "grown", methods=("push",), episodes=2))
+    more = table(tiny(tmp_path, "grown", methods=("push",), episodes=4))
+    assert more == table(tiny(tmp_path, "whole", methods=("push",), episodes=4))
+    assert rows_of(tmp_path / "grown" / STORE_NAME) == rows_of(tmp_path / "whole" / STORE_NAME)
+    assert table(tiny(tmp_path, "grown", methods=("push",), episodes=2)) == few
+
+
 def test_weights_that_changed_and_runs_of_another_method_are_refused(tmp_path: Path) -> None:
     """Catches a table of outcomes that the weights beside it never had."""
     untrained(tmp_path, "push", 0)
