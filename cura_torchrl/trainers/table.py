@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import itertools
 import multiprocessing
+import os
 import sys
+import threading
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
@@ -150,7 +152,8 @@ def _play_here(parts: list[_Part], keep: Callable[[_Part, list[Episode]], object
 
 
 def _play_in_processes(parts: list[_Part], workers: int, keep: Callable[[_Part, list[Episode]], object]) -> None:
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent) as pool:
         futures = {pool.submit(play_in_worker, part.config, part.index): part for part in parts}
         try:
             for future in as_completed(futures):
@@ -160,6 +163,18 @@ def _play_in_processes(parts: list[_Part], workers: int, keep: Callable[[_Part, 
             raise WorkerError(msg) from None
         finally:
             pool.shutdown(wait=False, cancel_futures=True)  # else leaving the block would play on to the end
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent is killed: it would wait for work forever."""
+    parent = multiprocessing.parent_process()
+
+    def wait() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _write(config: TableConfig, store: OutcomeStore) -> str:
