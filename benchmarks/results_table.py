@@ -15,15 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cura_torchrl.trainers.statistics import paired_difference
+from cura_torchrl.trainers.statistics import paired_difference, share_recovered
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SIZES = (0.5, 0.75, 1.0)
 METHODS = ("push-no-occlusion", "push", "cura-ppo")
-BOOTSTRAP = 10_000
-"""Samples of the scenes [1]."""
 
 
 def cell(result: dict[str, Any] | None) -> str:
@@ -63,23 +61,6 @@ def successes(results: list[dict[str, Any]]) -> NDArray[np.bool_]:
     return np.array([letter == "s" for result in results for letter in result["outcomes"]])
 
 
-def share_interval(no_occlusion: NDArray[np.bool_], push: NDArray[np.bool_], method: NDArray[np.bool_]) -> list[float]:
-    """Return the share of the loss by occlusion that a method wins back, with its 95 % bootstrap interval over scenes.
-
-    Args:
-        no_occlusion: Successes of the policy whose object hides nothing, shape ``[M]``.
-        push: Those of the baseline on the same scenes, shape ``[M]``.
-        method: Those of the method, shape ``[M]``.
-
-    Returns:
-        (method - push) / (no occlusion - push), its lower and its upper bound [1].
-    """
-    rows = np.random.default_rng(0).integers(0, len(push), (BOOTSTRAP, len(push)))
-    won, lost = (which.astype(float) - push for which in (method, no_occlusion))
-    shares = won[rows].sum(1) / lost[rows].sum(1)
-    return [float(won.sum() / lost.sum()), *(float(bound) for bound in np.quantile(shares, (0.025, 0.975)))]
-
-
 def comparison(results: list[dict[str, Any]]) -> str:
     """Return what occlusion costs and what CURA-PPO wins back, scene by scene, per cell and over all.
 
@@ -98,8 +79,8 @@ def comparison(results: list[dict[str, Any]]) -> str:
         gains = (paired_difference(push, other) for other in (free, cura))
         shown = [f"{100 * middle:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})" for middle, low, high in gains]
         lines.append(f"| {name} ({len(push)}) | {' | '.join(shown)} |")
-    free, push, cura = (successes([cell[method] for cell in cells.values()]) for method in METHODS)
-    share = ", ".join(f"{value:.2f}" for value in share_interval(free, push, cura))
+    trials = [[successes([cell[method]]) for method in METHODS] for cell in cells.values()]
+    share = ", ".join(f"{value:.2f}" for value in share_recovered(trials))
     return "\n".join(
         [*lines, "", f"Share of the loss won back over all cells, and its 95 % bootstrap interval: {share}."]
     )

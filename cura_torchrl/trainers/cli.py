@@ -26,6 +26,7 @@ from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.info import capabilities, git_commit, hardware, shipped_methods, versions
 from cura_torchrl.trainers.methods import METHODS, method
+from cura_torchrl.trainers.table_config import TableConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -201,6 +202,15 @@ def _demo(arguments: list[str]) -> None:
     sys.stdout.write(f"{page}\n")
 
 
+def _table(arguments: list[str]) -> None:
+    """Play methods in all cells and write the table of success rates."""
+    config = _parse(TableConfig, "table", arguments)
+    module = _import("cura_torchrl.trainers.table")
+    with _clean_stdout():
+        page = module.table(config)
+    sys.stdout.write(page)
+
+
 def _defaults(arguments: list[str]) -> TrainConfig:
     """Return what the flags of ``train`` start from: the method's preset, or the run's own configuration."""
     scout = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -291,6 +301,7 @@ _COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "imitate": _imitate,
     "train": _train,
     "evaluate": _evaluate,
+    "table": _table,
     "release": _release,
     "demo": _demo,
     "bench": _bench,

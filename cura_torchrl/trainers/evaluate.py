@@ -103,7 +103,7 @@ def summarise(episodes: list[Episode]) -> dict[str, Any]:
         "success_rate_025": sum(episode.success[1] for episode in episodes) / count,
         "success_rate_010_10deg": sum(episode.success[2] for episode in episodes) / count,
         "mean_steps": sum(episode.steps for episode in episodes) / count,
-        "outcomes": "".join(_outcome(episode) for episode in sorted(episodes, key=lambda episode: episode.index)),
+        "outcomes": "".join(outcome_letter(episode) for episode in sorted(episodes, key=lambda episode: episode.index)),
         "tipped": sum(episode.tipped for episode in episodes),
         "collisions_by": {
             name: sum(episode.contact[index] for episode in collisions)
@@ -112,7 +112,15 @@ def summarise(episodes: list[Episode]) -> dict[str, Any]:
     }
 
 
-def _outcome(episode: Episode) -> str:
+def outcome_letter(episode: Episode) -> str:
+    """Return how an episode ended.
+
+    Args:
+        episode: The episode.
+
+    Returns:
+        s for success, c for collision, t for time-out.
+    """
     return "s" if episode.success[0] else "c" if episode.collision else "t"
 
 
@@ -138,8 +146,8 @@ class Player:
             part: Index of the part; how many there are depends on the configuration alone.
             report: Called with every episode when it is over.
         """
-        first = part * _part_size(self._config)
-        last = min(first + _part_size(self._config), self._config.episodes)
+        first = part * part_size(self._config)
+        last = min(first + part_size(self._config), self._config.episodes)
         torch.manual_seed(self._config.seed * 1_000_003 + part)  # random actions only; all else is deterministic
         play_episodes(self._env, self._policy, torch.arange(first, last), report=report)
 
@@ -213,13 +221,20 @@ def _episode(index: int, last: TensorDictBase, reached: int) -> Episode:
     )
 
 
-def _part_size(config: EvaluateConfig) -> int:
-    """Return how many episodes a process plays at a time [1]; fixed, so that results do not depend on their number."""
+def part_size(config: EvaluateConfig) -> int:
+    """Return how many episodes a process plays at a time; fixed, so that results do not depend on their number.
+
+    Args:
+        config: Policy and scenarios.
+
+    Returns:
+        Episodes of a part [1]; the last one may have fewer.
+    """
     return 5 * config.chunk
 
 
 def _play_all(config: EvaluateConfig, report: Callable[[Episode], object]) -> None:
-    parts = range(-(-config.episodes // _part_size(config)))
+    parts = range(-(-config.episodes // part_size(config)))
     if config.num_workers == 1:
         with one_thread(), closing(Player(config)) as player:
             for part in parts:
@@ -227,12 +242,21 @@ def _play_all(config: EvaluateConfig, report: Callable[[Episode], object]) -> No
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(config.num_workers, len(parts)), mp_context=context) as pool:
-        for played in pool.map(functools.partial(_play_in_worker, config), parts):
+        for played in pool.map(functools.partial(play_in_worker, config), parts):
             for episode in played:
                 report(episode)
 
 
-def _play_in_worker(config: EvaluateConfig, part: int) -> list[Episode]:
+def play_in_worker(config: EvaluateConfig, part: int) -> list[Episode]:
+    """Play one part of the scenarios, with worlds that this process keeps for the next part.
+
+    Args:
+        config: Policy and scenarios.
+        part: Index of the part.
+
+    Returns:
+        How they were played, as they ended.
+    """
     played: list[Episode] = []
     with one_thread():
         _worker_player(config).play(part, played.append)

@@ -6,10 +6,15 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import binomtest, rankdata
+from scipy.stats import binomtest, rankdata, trim_mean
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import ArrayLike, NDArray
+
+BOOTSTRAP = 10_000
+"""Samples of a bootstrap [1]."""
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -84,6 +89,110 @@ def _phi(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
     product = float(one.sum()) * float(other.sum()) * (count - float(one.sum())) * (count - float(other.sum()))
     excess = both * neither - only_one * only_other
     return (max(excess - count / 2, 0.0) if excess > 0 else excess) / math.sqrt(product) if product > 0 else 0.0
+
+
+def mcnemar(first: ArrayLike, second: ArrayLike) -> float:
+    """Return how likely pairs differ as unevenly as these do, or more so, if both rates are the same.
+
+    Args:
+        first: Whether each trial succeeded, shape ``[M]``.
+        second: The same for the other set, subject by subject, shape ``[M]``.
+
+    Returns:
+        Exact two-sided p [1]; 1 where no pair differs.
+
+    Source:
+        McNemar (1947); exact: the discordant pairs are a binomial sample of rate 1/2.
+
+    Examples:
+        >>> mcnemar([1] * 8 + [0] * 2, [0] * 8 + [1] * 2)
+        0.109375
+    """
+    one, other = (np.asarray(trials, dtype=bool).ravel() for trials in (first, second))
+    only_one, only_other = int((one & ~other).sum()), int((other & ~one).sum())
+    if only_one + only_other == 0:
+        return 1.0
+    return float(binomtest(only_one, only_one + only_other, 0.5).pvalue)
+
+
+def interquartile_mean(rates: ArrayLike) -> NDArray[np.float64]:
+    """Return the mean of the middle half.
+
+    Args:
+        rates: Rates, shape ``[..., M]``; of fewer than four none is left out.
+
+    Returns:
+        Their interquartile mean, shape ``[...]``.
+
+    Source:
+        Agarwal et al. (2021), Deep reinforcement learning at the edge of the statistical precipice.
+
+    Examples:
+        >>> float(interquartile_mean([0.0, 0.4, 0.6, 1.0]))
+        0.5
+    """
+    return np.asarray(trim_mean(np.asarray(rates, dtype=np.float64), 0.25, axis=-1))
+
+
+def bootstrap_rates(
+    cells: Sequence[Sequence[ArrayLike]], samples: int = BOOTSTRAP, seed: int = 0
+) -> list[NDArray[np.float64]]:
+    """Return success rates of scenes and training seeds that are drawn anew, with replacement.
+
+    Scenes are drawn in each cell apart (stratified), the same for all methods, which are thereby paired. Seeds are
+    drawn for each method apart, the same for all cells, for one policy plays them all; with one seed only scenes vary.
+
+    Args:
+        cells: For each cell, for each method, whether each trial succeeded, shape ``[S, M]``: S seeds, M scenes.
+        samples: How often they are drawn, B [1].
+        seed: Seed of the draw [1].
+
+    Returns:
+        For each method the rates [1], shape ``[B, S, C]``: C cells.
+
+    Examples:
+        >>> [rates.shape for rates in bootstrap_rates([[[[1, 0, 1]], [[1, 1, 1]]]], samples=5)]
+        [(5, 1, 1), (5, 1, 1)]
+    """
+    rng = np.random.default_rng(seed)
+    trials = [[np.atleast_2d(np.asarray(entry, dtype=np.float64)) for entry in cell] for cell in cells]
+    drawn = [rng.integers(0, len(entry), (samples, len(entry))) for entry in trials[0]]
+    rates: list[list[NDArray[np.float64]]] = [[] for _ in drawn]
+    for cell in trials:
+        count = cell[0].shape[1]
+        weights = rng.multinomial(count, np.full(count, 1.0 / count), samples) / count
+        for found, seeds, entry in zip(rates, drawn, cell, strict=True):
+            found.append(np.take_along_axis(weights @ entry.T, seeds, 1))
+    return [np.stack(found, axis=-1) for found in rates]
+
+
+def share_recovered(cells: Sequence[Sequence[ArrayLike]], confidence: float = 0.95) -> tuple[float, float, float]:
+    """Return the share of a loss that a method wins back, with its bootstrap interval over seeds and scenes.
+
+    Args:
+        cells: For each cell, whether each trial succeeded without the loss, with it, and with the method, each of shape
+            ``[S, M]``: S training seeds, M scenes. Cells have equal weight.
+        confidence: Confidence level [1].
+
+    Returns:
+        (method - loss) / (no loss - loss), lower and upper bound [1]. NaN where nothing is lost; the bounds are NaN
+        where so many samples have no loss that the interval has an end at infinity.
+
+    Examples:
+        >>> share_recovered([[[1] * 10, [1] * 2 + [0] * 8, [1] * 8 + [0] * 2]])[0]
+        0.75
+    """
+    free, lossy, method = (np.mean([np.mean(np.asarray(cell[k])) for cell in cells]) for k in range(3))
+    if free <= lossy:
+        return math.nan, math.nan, math.nan
+    share = float(round((method - lossy) / (free - lossy), 12))
+    tail = (1.0 - confidence) / 2.0
+    without, with_, won = (rates.mean((1, 2)) for rates in bootstrap_rates(cells))
+    has_loss = without - with_ > 1e-12
+    if has_loss.mean() <= 1.0 - tail:
+        return share, math.nan, math.nan
+    low, high = np.quantile((won - with_)[has_loss] / (without - with_)[has_loss], (tail, 1.0 - tail))
+    return share, float(low), float(high)
 
 
 def area_under_roc(scores: ArrayLike, labels: ArrayLike) -> float:

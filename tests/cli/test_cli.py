@@ -19,6 +19,7 @@ from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.methods import METHODS, method
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
+from cura_torchrl.trainers.table_config import TableConfig
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -54,13 +55,19 @@ def test_help_lists_every_command_and_method() -> None:
     """Catches a command that nobody finds."""
     done = run("--help")
     assert done.returncode == 0
-    for name in ("pretrain-map", "imitate", "train", "evaluate", "release", "demo", "bench", "info", *METHODS):
+    for name in ("pretrain-map", "imitate", "train", "evaluate", "table", "release", "demo", "bench", "info", *METHODS):
         assert name in done.stdout
 
 
 @pytest.mark.parametrize(
     ("command", "config"),
-    [("train", TrainConfig), ("evaluate", EvaluateConfig), ("demo", DemoConfig), ("bench", BenchConfig)],
+    [
+        ("train", TrainConfig),
+        ("evaluate", EvaluateConfig),
+        ("table", TableConfig),
+        ("demo", DemoConfig),
+        ("bench", BenchConfig),
+    ],
 )
 def test_help_lists_every_field(command: str, config: type[object]) -> None:
     """Catches a setting that can only be changed in the code, and help that has to import torch."""
@@ -100,6 +107,9 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
             ["evaluate", "--method", "cura"],
             "method is 'cura' (did you mean cura-ppo?)",
         ),
+        (["table", "--methods", "push,cura"], "method is 'cura'; accepted: cura-ppo, push, push-no-occlusion"),
+        (["table", "--cells", "uniform-0.5", "uniform-9"], "cell is 'uniform-9'; accepted: all, or SCENARIO-SIZE"),
+        (["table", "--methods", "push", "--seeds", "7", "--runs", "{tmp}", "--out", "{tmp}"], "no checkpoint at"),
         (["bench"], "env,learner,lidar,ik,peers"),
         (["bench", "speed"], "speed"),
         (["bench", "env", "--rounds", "0"], "rounds is 0; accepted: 1 or more"),
@@ -146,6 +156,18 @@ def test_a_benchmark_prints_nothing_but_json(tmp_path: Path) -> None:
     path = tmp_path / "ik.json"
     done = run("bench", "ik", "--num-envs", "2", "--rounds", "1", "--output", str(path), "--json")
     assert json.loads(done.stdout) == json.loads(path.read_text(encoding="utf-8"))
+
+
+def test_a_table_of_outcomes_that_are_there_plays_nothing(tmp_path: Path) -> None:
+    """Catches a table that plays again what it has, or prints anything beside itself to stdout."""
+    flags_ = ["--methods", "push", "--cells", "uniform-0.5", "--episodes", "1", "--chunk", "1", "--num-workers", "2"]
+    arguments = ["table", *flags_, "--simulator", "planar", "--out", str(tmp_path)]
+    first = run(*arguments)
+    assert first.returncode == 0, first.stderr
+    assert first.stdout == (tmp_path / "table.md").read_text(encoding="utf-8")
+    second = run(*arguments)
+    assert second.stdout == first.stdout
+    assert "1/1 [00:00" in second.stderr
 
 
 def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:

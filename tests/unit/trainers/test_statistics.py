@@ -7,7 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from cura_torchrl.trainers.statistics import area_under_roc, correlation, paired_difference, wilson_interval
+from cura_torchrl.trainers.statistics import (
+    area_under_roc,
+    bootstrap_rates,
+    correlation,
+    interquartile_mean,
+    mcnemar,
+    paired_difference,
+    share_recovered,
+    wilson_interval,
+)
 
 
 def test_wilson_interval_is_the_closed_form() -> None:
@@ -49,6 +58,43 @@ def test_pairs_that_agree_narrow_the_interval_by_newcombes_phi() -> None:
     down = math.sqrt(0.0949**2 - 2 * 0.8393 * 0.0949 * 0.0974 + 0.0974**2)
     up = math.sqrt(0.0971**2 - 2 * 0.8393 * 0.0971 * 0.0944 + 0.0944**2)
     assert paired_difference(one, other) == pytest.approx((0.01, 0.01 - down, 0.01 + up), abs=3e-4)
+
+
+def test_mcnemars_p_is_the_exact_binomial_one() -> None:
+    """Catches pairs that agree and are counted, and a p of one side: 2 (C(10, 0) + C(10, 1) + C(10, 2)) / 2^10."""
+    assert mcnemar(*trials(30, 8, 2, 60)) == pytest.approx(0.109375, abs=1e-12)
+    assert mcnemar(*trials(30, 2, 8, 60)) == pytest.approx(0.109375, abs=1e-12)
+    assert mcnemar(*trials(5, 0, 0, 5)) == 1.0
+
+
+def test_interquartile_mean_leaves_a_quarter_out_at_each_end() -> None:
+    """Catches a mean that an outlier moves, and an axis that is mistaken."""
+    rates = [[0.0, 0.5, 0.6, 1.0], [1.0, 0.2, 0.4, 0.0]]
+    assert interquartile_mean(rates) == pytest.approx([0.55, 0.3])
+    assert float(interquartile_mean([0.0, 0.3, 0.9])) == pytest.approx(0.4)
+
+
+def test_drawn_scenes_are_the_same_for_all_methods_and_drawn_seeds_are_not() -> None:
+    """Catches pairs that are torn apart, which widens every interval of a difference."""
+    one = np.arange(40) % 2 == 0
+    first, same, opposite = bootstrap_rates([[[one], [one], [~one]]], samples=200)
+    assert np.array_equal(first, same)
+    assert np.allclose(first + opposite, 1.0)
+    # A rate of 1/2 in 40 scenes: standard deviation sqrt(0.25 / 40) = 0.079
+    assert first.std() == pytest.approx(0.079, abs=0.015)
+    seeds = np.array([[1] * 9, [0] * 9])
+    left, right = bootstrap_rates([[seeds, seeds], [seeds, seeds]], samples=200)
+    assert np.allclose(left[:, :, 0], left[:, :, 1])  # one policy plays all cells
+    assert not np.allclose(left, right)
+
+
+def test_share_of_a_loss_over_cells_is_that_of_the_mean_rates() -> None:
+    """Catches a mean of the cells' shares: here 1 and 0, where (0.8 - 0.6) / (0.9 - 0.6) is right."""
+    high, none = [[1] * 10, [1] * 6 + [0] * 4, [1] * 10], [[1] * 8 + [0] * 2, [1] * 6 + [0] * 4, [1] * 6 + [0] * 4]
+    share, low, upper = share_recovered([high, none])
+    assert share == pytest.approx(2 / 3)
+    assert low < share < upper
+    assert math.isnan(share_recovered([[[1, 0], [1, 1], [1, 1]]])[0])
 
 
 def test_pairs_that_do_not_vary_and_sets_of_other_sizes() -> None:

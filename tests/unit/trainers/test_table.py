@@ -1,0 +1,236 @@
+"""The table is what the outcomes say, however often playing was broken off."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import math
+import sqlite3
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+import pytest
+import torch
+
+from cura_torchrl.trainers.build import Networks
+from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
+from cura_torchrl.trainers.errors import CheckpointError, RunError
+from cura_torchrl.trainers.evaluate import Episode, Player
+from cura_torchrl.trainers.outcomes import PolicyRecord
+from cura_torchrl.trainers.paper_table import PAPER_CELLS, PAPER_SUCCESS, paper_success
+from cura_torchrl.trainers.table import STORE_NAME, table
+from cura_torchrl.trainers.table_config import TableConfig
+from cura_torchrl.trainers.table_report import as_csv, as_latex, as_markdown, compare, latex
+from tests.runs import small_run
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+METHODS = ("push-no-occlusion", "push", "cura-ppo")
+CELLS = ("uniform-0.5", "adversarial-1.0")
+
+
+def run_of(letters: str) -> list[Episode]:
+    """Episodes with these outcomes; in a collision the arm touched."""
+    return [
+        Episode(
+            index=index,
+            success=(letter == "s", False, False),
+            collision=letter == "c",
+            contact=(False, letter == "c", False),
+            tipped=False,
+            steps=9,
+        )
+        for index, letter in enumerate(letters)
+    ]
+
+
+def played(**letters: str) -> dict[str, dict[str, list[list[Episode]]]]:
+    """One run a method in one cell, from outcomes by method; ``free`` is the one without occlusion."""
+    names = {"free": "push-no-occlusion", "push": "push", "cura": "cura-ppo"}
+    return {names[name]: {"uniform-0.5": [run_of(outcomes)]} for name, outcomes in letters.items()}
+
+
+def untrained(folder: Path, method: str, seed: int, frames: int = 8) -> None:
+    """Write the run METHOD-SEED of untrained networks, with episodes of one second."""
+    torch.manual_seed(seed)
+    config = small_run(folder / f"{method}-{seed}", updates=1, method=method, simulator="planar")
+    config = config.replace(
+        env=dataclasses.replace(config.env, task=dataclasses.replace(config.env.task, episode_time=1.0))
+    )
+    save_checkpoint({"networks": Networks(config)}, config, config.run_dir / CHECKPOINT_FOLDER, frames=frames)
+
+
+def tiny(folder: Path, out: str, **changes: object) -> TableConfig:
+    """Two methods in a cell of seven scenes, in parts of five and two."""
+    options = {
+        "methods": ("push,cura-ppo",),
+        "cells": CELLS[:1],
+        "episodes": 7,
+        "chunk": 1,
+        "seeds": (0,),
+        "num_workers": 1,
+    }
+    return TableConfig(**options | {"simulator": "planar", "runs": folder, "out": folder / out} | changes)
+
+
+def rows_of(path: Path) -> list[tuple[object, ...]]:
+    """All outcomes of a file."""
+    with closing(sqlite3.connect(path)) as database:
+        return database.execute("SELECT * FROM outcomes").fetchall()
+
+
+def test_a_run_that_was_broken_off_ends_with_the_same_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches scenes that are lost, counted twice or played differently after the command was killed."""
+    untrained(tmp_path, "push", 0)
+    untrained(tmp_path, "cura-ppo", 0)
+    whole = table(tiny(tmp_path, "whole"))
+    play, parts = Player.play, []
+
+    def dies_in_the_third_part(self: Player, part: int, report: object) -> None:
+        parts.append(part)
+        play(self, part, report)
+        if len(parts) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Player, "play", dies_in_the_third_part)
+    with pytest.raises(KeyboardInterrupt):
+        table(tiny(tmp_path, "broken"))
+    assert len(rows_of(tmp_path / "broken" / STORE_NAME)) == 7
+    assert table(tiny(tmp_path, "broken")) == whole
+    assert parts == [0, 1, 0, 0, 1]  # the part that was being played is played again, no other one
+    assert table(tiny(tmp_path, "broken")) == whole
+    assert len(parts) == 5
+    assert rows_of(tmp_path / "broken" / STORE_NAME) == rows_of(tmp_path / "whole" / STORE_NAME)
+    for name in ("table.md", "table.csv", "table.tex"):
+        assert (tmp_path / "broken" / name).read_text() == (tmp_path / "whole" / name).read_text()
+
+
+def test_a_part_that_was_played_for_fewer_scenes_is_completed(tmp_path: Path) -> None:
+    """Catches scenes that stay unplayed because others of their part are there, and a table of all that is found."""
+    untrained(tmp_path, "push", 0)
+    few = table(tiny(tmp_path, "grown", methods=("push",), episodes=2))
+    more = table(tiny(tmp_path, "grown", methods=("push",), episodes=4))
+    assert more == table(tiny(tmp_path, "whole", methods=("push",), episodes=4))
+    assert rows_of(tmp_path / "grown" / STORE_NAME) == rows_of(tmp_path / "whole" / STORE_NAME)
+    assert table(tiny(tmp_path, "grown", methods=("push",), episodes=2)) == few
+
+
+def test_weights_that_changed_and_runs_of_another_method_are_refused(tmp_path: Path) -> None:
+    """Catches a table of outcomes that the weights beside it never had."""
+    untrained(tmp_path, "push", 0)
+    options = {"methods": ("push",), "episodes": 1}
+    table(tiny(tmp_path, "out", **options))
+    (tmp_path / "push-0").rename(tmp_path / "cura-ppo-0")
+    with pytest.raises(CheckpointError, match="is of method push; accepted: a run of cura-ppo"):
+        table(tiny(tmp_path, "out", methods=("cura-ppo",)))
+    (tmp_path / "cura-ppo-0").rename(tmp_path / "push-0")
+    table(tiny(tmp_path, "out", **options))
+    untrained(tmp_path, "push", 0, frames=16)
+    with pytest.raises(RunError, match="holds outcomes of push of seed 0 with weights"):
+        table(tiny(tmp_path, "out", **options))
+
+
+def test_pairs_and_share_are_those_worked_out_by_hand() -> None:
+    """Catches pairs that are counted the wrong way round, and a share of something else.
+
+    push succeeds in 4 of 20, without occlusion 16 do; cura-ppo wins 8 of what push lost and loses 2 of what it won:
+    10 of 20. Share: (10 - 4) / (16 - 4) = 0.5; p of 8 against 2: 2 (1 + 10 + 45) / 1024 = 0.109375.
+    """
+    results = compare(played(free="s" * 16 + "t" * 4, push="ssss" + "c" * 16, cura="sstt" + "s" * 8 + "c" * 5 + "ttt"))
+    cura = results[-1]
+    assert (cura.success, cura.collisions, cura.hit_arm, cura.hit_base, cura.timeouts) == (0.5, 0.25, 0.25, 0.0, 0.25)
+    assert (cura.difference, cura.mcnemar_p) == pytest.approx((0.3, 0.109375))
+    assert cura.share == pytest.approx(0.5)
+    assert cura.share_low < 0.5 < cura.share_high
+    # Wilson for 10 of 20, z^2 = 3.841459: half width 1.959964 sqrt(0.0125 + 0.0024009) / 1.192073 = 0.200703
+    assert (cura.low, cura.high) == pytest.approx((0.299298, 0.700702), abs=1e-5)
+    assert cura.paper == pytest.approx(0.8873)
+    assert math.isnan(cura.iqm)
+    assert math.isnan(results[1].difference)  # nobody is compared with himself
+
+
+def test_where_nothing_is_lost_there_is_no_share() -> None:
+    """Catches a division by zero, and an interval whose end is at infinity."""
+    result = compare(played(free="ssst", push="ssst", cura="ssss"))[-1]
+    assert math.isnan(result.share)
+    result = compare(played(free="ssst", push="sstt", cura="ssst"))[-1]
+    assert result.share == 1.0
+    assert math.isnan(result.share_low)
+
+
+def test_several_seeds_are_summed_up_by_mean_and_interquartile_mean() -> None:
+    """Catches an interval that takes the scenes of all seeds for independent.
+
+    Of 20 scenes the seeds solve 0, 10, 12 and 20: mean 42 / 80, middle half (10 + 12) / 40.
+    """
+    runs = [run_of("s" * count + "t" * (20 - count)) for count in (0, 10, 12, 20)]
+    result = compare({"push": {"uniform-0.5": runs}, "cura-ppo": {"uniform-0.5": runs}})[-1]
+    assert (result.seeds, result.scenes, result.success, result.iqm) == pytest.approx((4, 20, 0.525, 0.55))
+    assert result.high - result.low > 0.6  # Wilson's interval of 42 in 80 is 0.21 wide
+    assert math.isnan(result.mcnemar_p)
+    assert result.difference == 0.0
+    assert result.difference_low < -0.4 < 0.4 < result.difference_high  # seeds of two methods are no pairs
+
+
+def test_all_forms_show_the_same_numbers_and_say_what_the_interval_is() -> None:
+    """Catches a form that is forgotten, and an interval that passes for one over training seeds."""
+    results = compare({method: {cell: [run_of("sssc")] for cell in CELLS} for method in METHODS})
+    policy = PolicyRecord(method="push", training_seed=3, weights_sha256="ab" * 32, frames=1000, commit="c0ffee")
+    page = as_markdown(results, [policy], "4 scenes a cell")
+    assert (
+        "| CURA-PPO | 75.0 (30.1 to 95.4); paper 88.7 | 75.0 (30.1 to 95.4); paper 72.4 | 75.0 (40.9 to 92.9) |" in page
+    )
+    assert "The interval is over scenes only" in page
+    assert "| push | 3 | 1,000 | c0ffee | abababababab |" in page
+    lines = list(csv.DictReader(io.StringIO(as_csv(results))))
+    assert [(line["method"], line["cell"]) for line in lines] == [(m, c) for m in METHODS for c in (*CELLS, "all")]
+    assert (lines[0]["success"], lines[0]["paper"], lines[2]["paper"], lines[0]["share"]) == ("0.75", "0.9204", "", "")
+    assert r"CURA-PPO & 75.0 (30.1--95.4), paper 88.7 &" in as_latex(results)
+    assert as_latex(results).count(r"\\") == 1 + len(METHODS)
+
+
+def test_latex_takes_no_name_for_a_command() -> None:
+    """Catches a name that breaks the typesetting, or whose backslash is escaped twice."""
+    assert latex("a_b & 5 % #1 ${x}") == r"a\_b \& 5 \% \#1 \$\{x\}"
+    assert latex("\\^~") == r"\textbackslash{}\textasciicircum{}\textasciitilde{}"
+
+
+def test_the_papers_numbers_are_in_the_order_of_its_cells() -> None:
+    """Catches a row with a number too few, and sizes that are swapped."""
+    assert {len(rates) for rates in PAPER_SUCCESS.values()} == {len(PAPER_CELLS)}
+    assert paper_success("cura-ppo", "adversarial-0.75") == 0.7459
+    # (74.20 + 66.39 + 42.34 + 65.25 + 48.86 + 22.90) / 6
+    assert paper_success("push", "all") == pytest.approx(0.533233, abs=1e-6)
+    assert paper_success("push", "mixed-0.5") is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"cells": ("uniform-2.0",)},
+            "cell is 'uniform-2.0'; accepted: all, or SCENARIO-SIZE with uniform, adversarial",
+        ),
+        ({"cells": ("uniform",)}, "cell is 'uniform'"),
+        ({"cells": ("everywhere-0.5",)}, "cell is 'everywhere-0.5'"),
+        ({"cells": ("uniform-nan",)}, "cell is 'uniform-nan'"),
+        ({"methods": ("push", "cura")}, r"method is 'cura'; accepted: .*\(did you mean cura-ppo\?\)"),
+        ({"methods": ("push-conf",)}, "method is 'push-conf'; accepted: cura-ppo, push, push-no-occlusion"),
+        ({"methods": (",",)}, "methods is "),
+        ({"episodes": 0}, "episodes is 0; accepted: 1 or more"),
+        ({"seeds": (1, 1)}, "seeds is "),
+    ],
+)
+def test_a_setting_that_makes_no_sense_is_refused_in_one_line(changes: dict[str, object], message: str) -> None:
+    """Catches an hour of playing that ends in an error, or in a table of the wrong cells."""
+    with pytest.raises(ValueError, match=message) as told:
+        TableConfig(**changes)
+    assert "\n" not in str(told.value)
+
+
+def test_names_may_be_joined_by_commas() -> None:
+    """Catches a list that is read as one name, and a cell that is spelt in two ways and played twice."""
+    config = TableConfig(methods=("push,cura-ppo",), cells=("all", "uniform-1,uniform-1.0"))
+    assert (config.methods, config.cells) == (("push", "cura-ppo"), PAPER_CELLS)
