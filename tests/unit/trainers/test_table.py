@@ -217,7 +217,7 @@ def test_the_papers_numbers_are_in_the_order_of_its_cells() -> None:
         ({"cells": ("everywhere-0.5",)}, "cell is 'everywhere-0.5'"),
         ({"cells": ("uniform-nan",)}, "cell is 'uniform-nan'"),
         ({"methods": ("push", "cura")}, r"method is 'cura'; accepted: .*\(did you mean cura-ppo\?\)"),
-        ({"methods": ("push-conf",)}, "method is 'push-conf'; accepted: cura-ppo, push, push-no-occlusion"),
+        ({"methods": ("push-base",)}, "method is 'push-base'; accepted: cura-no-risk, "),
         ({"methods": (",",)}, "methods is "),
         ({"episodes": 0}, "episodes is 0; accepted: 1 or more"),
         ({"seeds": (1, 1)}, "seeds is "),
