@@ -9,11 +9,15 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from results_table import SIZES, successes
 
 from cura_torchrl.trainers.statistics import paired_difference
 
-SIZES = (0.5, 0.75, 1.0)
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 def read(folder: Path) -> dict[tuple[str, str, int, float], dict[str, Any]]:
@@ -23,15 +27,10 @@ def read(folder: Path) -> dict[tuple[str, str, int, float], dict[str, Any]]:
     return {(r["method"], r["scenario"], r["max_obstacles"], r["object_size"]): r for r in paired}
 
 
-def successes(results: list[dict[str, Any]]) -> list[bool]:
-    """Return whether each scene of some cells ended in success, cell by cell."""
-    return [letter == "s" for result in results for letter in result["outcomes"]]
-
-
-def row(name: str, one: list[bool], other: list[bool]) -> str:
+def row(name: str, one: NDArray[np.bool_], other: NDArray[np.bool_]) -> str:
     """Return a row of the table: rates of both simulators, scene by scene, and their difference in points."""
     middle, low, high = (100 * value for value in paired_difference(one, other))
-    rates = " | ".join(f"{100 * sum(own) / len(own):.1f} ({len(own)})" for own in (one, other))
+    rates = " | ".join(f"{100 * own.mean():.1f} ({len(own)})" for own in (one, other))
     return f"| {name} | {rates} | {middle:+.1f} ({low:+.1f} to {high:+.1f}) |"
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cura_torchrl.trainers.evaluate import outcome_letter
+from cura_torchrl.trainers.evaluate import summarise
 from cura_torchrl.trainers.methods import METHODS
 from cura_torchrl.trainers.outcomes import SHIPPED
 from cura_torchrl.trainers.paper_table import PAPER_CELLS, paper_success
@@ -118,12 +118,11 @@ def compare(played: Played) -> list[Result]:
 def _result(played: Played, method: str, name: str, group: list[str]) -> Result:
     runs = [run for cell in group for run in played[method][cell]]
     episodes = [episode for run in runs for episode in run]
-    collisions = [episode for episode in episodes if episode.collision]
+    counts = summarise(episodes)
     is_printed = name != "all" or set(group) == set(PAPER_CELLS)
     printed = paper_success(method, name) if is_printed else None
-    count, seeds = len(episodes), len(played[method][group[0]])
-    reached = [sum(episode.success[index] for episode in episodes) / count for index in range(3)]
-    base, arm, object_ = (sum(episode.contact[index] for episode in collisions) / count for index in range(3))
+    count, seeds = counts["episodes"], len(played[method][group[0]])
+    hits = {f"hit_{name}": number / count for name, number in counts["collisions_by"].items()}
     iqm, low, high = _interval([_trials(played[method][cell]) for cell in group])
     difference, p = _difference(played, method, group)
     share = _share(played, method, group)
@@ -132,19 +131,17 @@ def _result(played: Played, method: str, name: str, group: list[str]) -> Result:
         cell=name,
         seeds=seeds,
         scenes=count // seeds,
-        success=reached[0],
+        success=counts["success_rate"],
         low=low,
         high=high,
         iqm=iqm,
         paper=math.nan if printed is None else printed,
-        success_025=reached[1],
-        success_010_10deg=reached[2],
-        collisions=len(collisions) / count,
-        hit_base=base,
-        hit_arm=arm,
-        hit_object=object_,
-        timeouts=sum(outcome_letter(episode) == "t" for episode in episodes) / count,
-        tipped=sum(episode.tipped for episode in episodes) / count,
+        success_025=counts["success_rate_025"],
+        success_010_10deg=counts["success_rate_010_10deg"],
+        collisions=counts["collisions"] / count,
+        **hits,
+        timeouts=counts["timeouts"] / count,
+        tipped=counts["tipped"] / count,
         **dict(zip(("difference", "difference_low", "difference_high"), difference, strict=True)),
         mcnemar_p=p,
         **dict(zip(("share", "share_low", "share_high"), share, strict=True)),
