@@ -8,7 +8,7 @@ train=$(dirname "$0")/../train_on_planar.sh
 branch() { # NAME METHOD FLAG...
   local name=$1 method=$2
   shift 2
-  NAME=$name START=$runs/push-conf-0 WORKERS=1 "$train" "$runs" "$frames" "$method" -- --learner-threads 1 \
+  START=$runs/push-conf-0 WORKERS=1 "$train" "$runs/$name" "$frames" "$method" -- --learner-threads 1 \
     --ppo.critic-warmup-frames 0 --cura.costs-start-frames 0 "$@"
 }
 weigh() { # RISK_COEFF UNCERTAINTY_COEFF: beside an advantage of deviation 1

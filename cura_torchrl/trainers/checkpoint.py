@@ -27,6 +27,7 @@ from cura_torchrl.trainers.errors import CheckpointError
 from cura_torchrl.trainers.info import git_commit, shipped_methods, versions
 from cura_torchrl.trainers.methods import METHODS
 from cura_torchrl.trainers.progress import PROGRESS_NAME
+from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINT_FOLDER = "checkpoints"
-"""Folder of a run that holds its checkpoints."""
 CONFIG_NAME = "config.json"
 """File of a checkpoint with the resolved configuration and where it came from."""
 SUMS_NAME = "SHA256SUMS"

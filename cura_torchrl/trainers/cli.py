@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import importlib
 import io
 import json
@@ -23,10 +24,11 @@ import tyro
 from cura_torchrl.trainers.bench_config import BenchConfig
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
-from cura_torchrl.trainers.errors import RunError
+from cura_torchrl.trainers.errors import RunError, RunsFailedError
 from cura_torchrl.trainers.info import capabilities, git_commit, hardware, shipped_methods, versions
 from cura_torchrl.trainers.methods import METHODS, method
 from cura_torchrl.trainers.table_config import TableConfig
+from cura_torchrl.trainers.train_all_config import PlannedRun, TrainAllConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -44,6 +46,21 @@ class TrainOptions:
     """Go on from the newest good checkpoint in the run's folder."""
     init_from: Path | None = None
     """Run or checkpoint whose networks to start from; optimisers, counters and curriculum start afresh."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainAllOptions:
+    """Train every method with every seed, each as a run METHOD-SEED of train; what is trained already is kept.
+
+    The same command goes on after an interruption. Flags after -- are those of train, the same for all runs.
+    """
+
+    config: Annotated[TrainAllConfig, tyro.conf.arg(name="")]
+    """The runs."""
+    status: bool = False
+    """Print how far each run is, and start nothing."""
+    json: bool = False
+    """Print that as JSON."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Arguments; those of the process if None.
 
     Returns:
-        Exit code: 0, 2 after a one-line error, 130 and 143 after SIGINT and SIGTERM.
+        Exit code: 0, 2 after a one-line error, 1 if some of several runs failed, 130 and 143 after SIGINT and SIGTERM.
     """
     # PyTorch then takes huge pages for large tensors. It reads this once, when it makes the first one.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
@@ -132,6 +149,37 @@ def _train(arguments: list[str]) -> None:
     with _clean_stdout():
         checkpoint = module.train(options.config, resume=options.resume, init_from=options.init_from)
     sys.stdout.write(f"{checkpoint}\n")
+
+
+def _train_all(arguments: list[str]) -> None:
+    """Train methods with several seeds, unattended."""  # noqa: DOC501 - the first line is the overview's
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    options = _parse(TrainAllOptions, "train-all", arguments[:end])
+    config = options.config
+    runs = [_plan(config, name, seed, arguments[end + 1 :]) for name in config.methods for seed in config.seeds]
+    if options.status:
+        read = _import("cura_torchrl.trainers.run_status").read_status
+        statuses = [read(run) for run in runs]
+    else:
+        module = _import("cura_torchrl.trainers.train_all")
+        with _clean_stdout():
+            statuses = module.train_all(config, runs)
+    found = [dataclasses.asdict(status) for status in statuses]
+    lines = "".join(f"{status.as_line()}\n" for status in statuses)
+    sys.stdout.write(json.dumps(found, indent=2) + "\n" if options.json else lines)
+    failed = [f"{status.method}-{status.seed}" for status in statuses if status.state == "failed"]
+    if failed and not options.status:
+        msg = f"{len(failed)} of {len(runs)} runs failed: {', '.join(failed)}; the same command tries them again"
+        raise RunsFailedError(msg)
+
+
+def _plan(config: TrainAllConfig, name: str, seed: int, flags: list[str]) -> PlannedRun:
+    with _one_line_errors():
+        words = config.train_arguments(name, seed, flags)
+    start = config.start_of(name)
+    _require_path(start)
+    asked = _parse(TrainOptions, "train", list(words), TrainOptions(config=_defaults(list(words))))
+    return PlannedRun(config=asked.config, arguments=words, init_from=start)
 
 
 def _evaluate(arguments: list[str]) -> None:
@@ -300,6 +348,7 @@ _COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "pretrain-map": _pretrain_map,
     "imitate": _imitate,
     "train": _train,
+    "train-all": _train_all,
     "evaluate": _evaluate,
     "table": _table,
     "release": _release,

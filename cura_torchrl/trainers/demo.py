@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from cura_torchrl.trainers import figures, render
 from cura_torchrl.trainers.build import load_encoder
-from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, load_policy, progress_path
+from cura_torchrl.trainers.checkpoint import load_policy, progress_path
 from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError, UnavailableError
 from cura_torchrl.trainers.evaluate import summarise
@@ -29,6 +29,7 @@ from cura_torchrl.trainers.methods import METHODS
 from cura_torchrl.trainers.page import Card, make_page
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.recording import Recording, choose_scenes, record
+from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
 from cura_torchrl.trainers.threads import one_thread
 from cura_torchrl.trainers.train import most_obstacles, train
 

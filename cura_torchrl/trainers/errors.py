@@ -41,6 +41,12 @@ class NodeLostError(WorkerError):
         self.node_ids = node_ids
 
 
+class RunsFailedError(RunError):
+    """Of several runs some have failed; the others are done."""
+
+    exit_code = 1
+
+
 class UnavailableError(RunError):
     """A part that was asked for is not installed or not there."""
 
@@ -50,12 +56,13 @@ class Interrupted(RunError):  # noqa: N818 - no error of anyone's: the run was a
 
     Args:
         number: The signal.
+        advice: How to go on.
 
     Examples:
         >>> Interrupted(signal.SIGTERM).exit_code
         143
     """
 
-    def __init__(self, number: int) -> None:
-        super().__init__(f"stopped by {signal.Signals(number).name} with a checkpoint written; go on with --resume")
+    def __init__(self, number: int, advice: str = "go on with --resume") -> None:
+        super().__init__(f"stopped by {signal.Signals(number).name} with a checkpoint written; {advice}")
         self.exit_code = 128 + number

@@ -27,9 +27,10 @@ from cura_torchrl import keys
 from cura_torchrl.envs.config import Simulator, require, require_finite
 from cura_torchrl.envs.robots.scripted import ScriptedAvoider, ScriptedPusher
 from cura_torchrl.trainers.build import Networks, make_env
-from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
+from cura_torchrl.trainers.checkpoint import save_checkpoint
 from cura_torchrl.trainers.config import Perception
 from cura_torchrl.trainers.methods import method
+from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:

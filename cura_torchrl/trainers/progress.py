@@ -8,7 +8,6 @@ import math
 import sys
 from typing import TYPE_CHECKING
 
-from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
 from cura_torchrl.trainers.errors import UnavailableError
@@ -112,4 +111,6 @@ def _make_logger(config: TrainConfig) -> Logger:
         install = f"pip install cura-torchrl[{config.logger}]"
         msg = f"logger is {config.logger!r}, which is not installed; accepted: csv, or first {install}"
         raise UnavailableError(msg)
+    from torchrl.record.loggers import get_logger  # noqa: PLC0415 - rows are read without torch
+
     return get_logger(config.logger, logger_name=str(config.run_dir), experiment_name="log")

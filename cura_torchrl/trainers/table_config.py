@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, cast, get_args
 
 from cura_torchrl.envs.config import ScenarioKind, Simulator, require, require_finite
 from cura_torchrl.trainers.info import shipped_methods
+from cura_torchrl.trainers.lists import Numbers, split_names
 from cura_torchrl.trainers.methods import METHODS
 from cura_torchrl.trainers.paper_table import PAPER_CELLS
 
@@ -73,8 +74,9 @@ class TableConfig:
     """Most obstacles K in an episode; the count is uniform in 0..K. Range: 0 to 6."""
     seed: int = 0
     """Seed of the scenes [1]."""
-    seeds: tuple[int, ...] = ()
-    """Training seeds: the policies are then the runs METHOD-SEED in the folder of runs; none takes shipped weights."""
+    seeds: Numbers = ()
+    """Training seeds, one after the other or joined by commas: the policies are then the runs METHOD-SEED in the folder
+    of runs; none takes shipped weights."""
     runs: Path = Path("runs")
     """Folder of runs, for the training seeds."""
     simulator: Simulator = "bullet"
@@ -88,8 +90,8 @@ class TableConfig:
 
     def __post_init__(self) -> None:
         require_finite(self)
-        object.__setattr__(self, "methods", _split(self.methods))
-        object.__setattr__(self, "cells", tuple(cell.name for cell in _cells(_split(self.cells))))
+        object.__setattr__(self, "methods", split_names(self.methods))
+        object.__setattr__(self, "cells", tuple(cell.name for cell in _cells(split_names(self.cells))))
         require(bool(self.methods), "methods", self.methods, "one or more methods")
         require(bool(self.cells), "cells", self.cells, _CELL_NAMES)
         accepted = tuple(METHODS) if self.seeds else tuple(shipped_methods())
@@ -103,11 +105,6 @@ class TableConfig:
         require(0 <= self.seed < 2**31, "seed", self.seed, "0 to 2147483647")
         are_seeds = all(0 <= seed < 2**31 for seed in self.seeds) and len(set(self.seeds)) == len(self.seeds)
         require(are_seeds, "seeds", self.seeds, "different ones of 0 to 2147483647")
-
-
-def _split(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names, each once, those that are joined by commas apart."""
-    return tuple(dict.fromkeys(part.strip() for name in names for part in name.split(",") if part.strip()))
 
 
 def _cells(names: Iterable[str]) -> list[Cell]:

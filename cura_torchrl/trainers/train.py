@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import fcntl
 import logging
 import signal
 import threading
@@ -16,7 +15,6 @@ from torchrl.checkpoint import GlobalRNGState
 
 from cura_torchrl.trainers.build import Networks, build_collector
 from cura_torchrl.trainers.checkpoint import (
-    CHECKPOINT_FOLDER,
     find_checkpoint,
     read_config,
     restore,
@@ -32,6 +30,7 @@ from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NodeLostE
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.progress import Progress
 from cura_torchrl.trainers.ray_backend import RayRollouts, require_ray
+from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER, locked
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -70,7 +69,7 @@ def train(config: TrainConfig, *, resume: bool = False, init_from: Path | None =
     _require_device(config.device)
     if config.backend == "ray":
         require_ray()
-    with _locked(config.run_dir), _Signals() as signals:
+    with locked(config.run_dir), _Signals() as signals:
         return _Run(config, resume=resume, init_from=init_from).loop(signals)
 
 
@@ -276,19 +275,6 @@ class _Signals:
     def _restore(self) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    # Keeps a second process from training in the same folder; the lock dies with the process.
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            msg = f"{folder} is being trained in by another process; accepted: another --run-dir"
-            raise CheckpointError(msg) from None
-        yield
 
 
 @contextmanager

@@ -19,7 +19,10 @@ from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.methods import METHODS, method
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
+from cura_torchrl.trainers.run_folder import is_locked
+from cura_torchrl.trainers.run_status import read_record
 from cura_torchrl.trainers.table_config import TableConfig
+from cura_torchrl.trainers.train_all_config import TrainAllConfig
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -55,7 +58,8 @@ def test_help_lists_every_command_and_method() -> None:
     """Catches a command that nobody finds."""
     done = run("--help")
     assert done.returncode == 0
-    for name in ("pretrain-map", "imitate", "train", "evaluate", "table", "release", "demo", "bench", "info", *METHODS):
+    learning = ("pretrain-map", "imitate", "train", "train-all")
+    for name in (*learning, "evaluate", "table", "release", "demo", "bench", "info", *METHODS):
         assert name in done.stdout
 
 
@@ -63,6 +67,7 @@ def test_help_lists_every_command_and_method() -> None:
     ("command", "config"),
     [
         ("train", TrainConfig),
+        ("train-all", TrainAllConfig),
         ("evaluate", EvaluateConfig),
         ("table", TableConfig),
         ("demo", DemoConfig),
@@ -110,6 +115,11 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
         (["table", "--methods", "push,cura"], "method is 'cura'; accepted: cura-no-risk, "),
         (["table", "--cells", "uniform-0.5", "uniform-9"], "cell is 'uniform-9'; accepted: all, or SCENARIO-SIZE"),
         (["table", "--methods", "push", "--seeds", "7", "--runs", "{tmp}", "--out", "{tmp}"], "no checkpoint at"),
+        (["train-all", "--methods", "push,cura"], "method is 'cura' (did you mean cura-ppo?)"),
+        (["train-all", "--seeds", "0,one"], "--seeds"),
+        (["train-all", "--init-from", "push={tmp}/none"], "no checkpoint at"),
+        (["train-all", "--runs", "{tmp}", "--", "--seed", "3"], "flag after -- is '--seed'; accepted: the flags of"),
+        (["train-all", "--runs", "{tmp}", "--", "--num-evns", "3"], "Unrecognized options: --num-evns"),
         (["bench"], "env,learner,lidar,ik,peers"),
         (["bench", "speed"], "speed"),
         (["bench", "env", "--rounds", "0"], "rounds is 0; accepted: 1 or more"),
@@ -190,3 +200,40 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
     assert frames[-1] == last + 2 * FRAMES
     assert not list((folder / CHECKPOINT_FOLDER).glob(".stage-*"))
     assert done.stdout.strip().endswith(f"checkpoint-{last + 2 * FRAMES:012d}")
+
+
+def test_the_state_of_runs_is_told_without_starting_any(tmp_path: Path) -> None:
+    """Catches a look that trains, and JSON that lacks a run."""
+    flags_ = ["--methods", "push,cura-ppo", "--seeds", "0,1", "--runs", str(tmp_path)]
+    done = run("train-all", *flags_, "--status", "--json")
+    assert done.returncode == 0, done.stderr
+    found = [(entry["method"], entry["seed"], entry["state"]) for entry in json.loads(done.stdout)]
+    assert found == [(name, seed, "waiting") for name in ("push", "cura-ppo") for seed in (0, 1)]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_killed_with_its_parent_a_run_goes_on_and_no_frame_is_trained_twice(tmp_path: Path) -> None:
+    """Catches a second process beside one that outlived its parent, and a run that starts over."""
+    folder = tmp_path / "push-0"
+    own = ["train-all", "--methods", "push", "--runs", str(tmp_path), "--simulator", "planar", "--total-frames"]
+    with subprocess.Popen([*COMMAND, *own, "1000000", "--", *SMALL[2:]], stderr=subprocess.DEVNULL) as parent:
+        deadline = time.monotonic() + 180
+        while len(read_progress(folder / PROGRESS_NAME)) < 2 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        parent.kill()
+    assert is_locked(folder)
+    status = json.loads(run(*own, "1000000", "--status", "--json", "--", *SMALL[2:]).stdout)
+    assert status[0]["state"] == "running"
+    os.kill(read_record(folder)["pid"], signal.SIGKILL)
+    last = max(int(entry.name.split("-")[1]) for entry in (folder / CHECKPOINT_FOLDER).glob("checkpoint-*"))
+    total = str(last + 2 * FRAMES)
+    done = run(*own, total, "--", *SMALL[2:])
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split()[:3] == ["push", "0", "done"]
+    frames = [row["frames"] for row in read_progress(folder / PROGRESS_NAME)]
+    assert frames == [FRAMES * (index + 1) for index in range(len(frames))]
+    assert frames[-1] == last + 2 * FRAMES
+    log = (folder / "train.log").read_text(encoding="utf-8")
+    assert log.count("cura_torchrl.trainers.cli train ") == 2  # one process before, one after

@@ -61,6 +61,10 @@ def test_python_blocks_run(page: Path, code: str, tmp_path: Path, monkeypatch: p
 def test_shown_commands_exist_with_their_flags(words: list[str]) -> None:
     """Catches a command or flag in the documentation that the command line does not have (any more)."""
     text = _help(words[0]) if words[0] != "--help" else _help()
+    if "--" in words:  # what follows is for another command
+        end = words.index("--")
+        words, others = words[:end], words[end + 1 :]
+        test_shown_commands_exist_with_their_flags(["train", *others])
     flags = [word.partition("=")[0] for word in words[1:] if word.startswith("--")]
     assert [flag for flag in flags if not re.search(rf"{re.escape(flag)}\b", text)] == []
 

@@ -17,6 +17,7 @@ from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint,
 from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NonFiniteError, UnavailableError, WorkerError
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
+from cura_torchrl.trainers.run_folder import locked
 from cura_torchrl.trainers.train import RandomState, most_obstacles, train
 from tests.runs import FRAMES, small_run
 
@@ -93,7 +94,7 @@ def test_a_folder_with_a_run_is_not_overwritten(config: TrainConfig) -> None:
 
 def test_two_processes_do_not_train_in_one_folder(config: TrainConfig) -> None:
     """Catches checkpoints of two runs mixed in one folder."""
-    with module._locked(config.run_dir), pytest.raises(CheckpointError, match="is being trained in by another process"):
+    with locked(config.run_dir), pytest.raises(CheckpointError, match="is being trained in by another process"):
         train(config)
 
 
