@@ -13,7 +13,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from cura_torchrl.trainers.checkpoint import find_checkpoint, load_policy, progress_path
-from cura_torchrl.trainers.methods import METHODS
+from cura_torchrl.trainers.methods import PRESETS
 from cura_torchrl.trainers.progress import read_progress
 
 PANELS = (
@@ -48,7 +48,7 @@ def rows_of(run: str) -> list[dict[str, float]]:
     """
     if run.endswith(".csv"):
         return read_progress(Path(run))
-    source = load_policy(run).path if run in METHODS else find_checkpoint(Path(run))
+    source = load_policy(run).path if run in PRESETS else find_checkpoint(Path(run))
     return read_progress(progress_path(source))
 
 

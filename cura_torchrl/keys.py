@@ -75,6 +75,21 @@ RISK = "risk"
 UNCERTAINTY = "uncertainty"
 """Population variance of the collision atoms, paper Eq. (5), shape ``[*, 1]``."""
 
+OBSTACLE_CODE = "obstacle_code"
+"""True obstacles for an estimator that sees all of them, shape ``[*, 24]``; see ``trainers.privileged.ObstacleCode``.
+
+Privileged: emitted while training with ``CURAConfig.uncertainty = "perceptual"`` only.
+"""
+PRIVILEGED_ATOMS = "privileged_atoms"
+"""Atoms of the collision possibility C given the full state s, unsorted, shape ``[*, N]``."""
+PRIVILEGED_RISK = "privileged_risk"
+"""Expected collision possibility given the full state, m(s) = E[C | s], shape ``[*, 1]``."""
+PRIVILEGED_TARGET = "privileged_target"
+"""SR(lambda) target atoms of the estimator that sees the full state, shape ``[*, N]``."""
+PERCEPTUAL_ATOMS = "perceptual_atoms"
+"""Atoms of m(s) given the observation o, unsorted, shape ``[*, N]``; their variance is Var(E[C | s] | o)."""
+PERCEPTUAL_TARGET = "perceptual_target"
+"""The one target atom m(s) of the perceptual estimator, shape ``[*, 1]``."""
 ADVANTAGE = "advantage"
 """Advantage that the policy maximises, shape ``[*, 1]``."""
 

@@ -9,6 +9,7 @@ from cura_torchrl.modules.functional import (
     atom_quantile,
     atom_variance,
     conditional_value_at_risk,
+    make_risk_measure,
     quantile_midpoints,
     wang_risk,
 )
@@ -27,6 +28,7 @@ __all__ = [
     "conditional_value_at_risk",
     "make_actor",
     "make_critic",
+    "make_risk_measure",
     "quantile_midpoints",
     "wang_risk",
 ]

@@ -58,7 +58,8 @@ class DistributionalCollisionEstimator(TensorDictModule):
         activation: Module class between layers.
         observation_norm: Normalisation of the first input, shared by reference.
         risk_measure: What to read as risk from the atoms, such as
-            ``functools.partial(conditional_value_at_risk, alpha=0.25)``; the paper takes the mean.
+            :func:`~cura_torchrl.modules.make_risk_measure` returns; the paper takes the mean. This alone decides: the
+            risk cost, logs and pictures read what the estimator writes.
         in_keys: Keys of the inputs, the observation first.
         out_keys: Keys of atoms, risk and uncertainty.
 

@@ -6,7 +6,13 @@ not tied to a quantile level. Mean and variance need no order; quantiles and tai
 
 from __future__ import annotations
 
+import functools
+from typing import TYPE_CHECKING, Literal
+
 import torch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 def quantile_midpoints(num_atoms: int, *, dtype: torch.dtype = torch.float32) -> torch.Tensor:
@@ -149,6 +155,46 @@ def wang_risk(atoms: torch.Tensor, beta: float) -> torch.Tensor:
     """
     edges = _cumulative_share(atoms)
     return _distorted_mean(atoms, torch.special.ndtr(torch.special.ndtri(edges) - beta))
+
+
+def make_risk_measure(
+    kind: Literal["mean", "cvar", "wang"], level: float = 0.25
+) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return a risk measure by its name.
+
+    Measures of the tail see the atoms clamped to [0, 1], the range of the collision possibility: what a linear head
+    overshoots averages out in a mean, but not in a tail.
+
+    Args:
+        kind: The mean, as in the paper, :func:`conditional_value_at_risk` or :func:`wang_risk`.
+        level: alpha of CVaR, beta of Wang's measure [1]; the mean has none.
+
+    Returns:
+        Function from atoms, shape ``[*B, N]``, to the risk, shape ``[*B]``; it can be pickled.
+
+    Raises:
+        ValueError: If there is no such measure.
+
+    Examples:
+        >>> make_risk_measure("cvar", 0.5)(torch.tensor([0.0, 0.5, 0.25, 1.5])).item()  # (0.5 + 1.0) / 2
+        0.75
+    """
+    if kind == "mean":
+        return atom_mean
+    if kind == "cvar":
+        return functools.partial(_clamped_cvar, alpha=level)
+    if kind == "wang":
+        return functools.partial(_clamped_wang, beta=level)
+    msg = f"risk measure is {kind!r}; accepted: mean, cvar, wang"
+    raise ValueError(msg)
+
+
+def _clamped_cvar(atoms: torch.Tensor, alpha: float) -> torch.Tensor:
+    return conditional_value_at_risk(atoms.clamp(0.0, 1.0), alpha)
+
+
+def _clamped_wang(atoms: torch.Tensor, beta: float) -> torch.Tensor:
+    return wang_risk(atoms.clamp(0.0, 1.0), beta)
 
 
 def _cumulative_share(atoms: torch.Tensor) -> torch.Tensor:

@@ -12,10 +12,12 @@ from cura_torchrl.objectives.functional import (
     standardise,
     uncertainty_cost,
 )
+from cura_torchrl.objectives.perceptual import PerceptualObjective
 
 __all__ = [
     "CURAAdvantage",
     "CURALoss",
+    "PerceptualObjective",
     "energy_distance",
     "normalise",
     "risk_cost",

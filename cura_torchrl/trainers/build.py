@@ -10,18 +10,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
+from cura_torchrl import keys
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE
 from cura_torchrl.envs.push import ACTION_SIZE, PushEnv
 from cura_torchrl.envs.transforms import ConfidenceMap, EncodeMap
-from cura_torchrl.modules import DistributionalCollisionEstimator, MapVAE, ObservationNorm, make_actor, make_critic
-from cura_torchrl.objectives import CURAAdvantage, CURALoss
+from cura_torchrl.modules import (
+    DistributionalCollisionEstimator,
+    MapVAE,
+    ObservationNorm,
+    make_actor,
+    make_critic,
+    make_risk_measure,
+)
+from cura_torchrl.objectives import CURAAdvantage, CURALoss, PerceptualObjective
 from cura_torchrl.trainers.errors import UnavailableError
-from cura_torchrl.trainers.privileged import ObstacleCode
+from cura_torchrl.trainers.privileged import CODE_SIZE, ObstacleCode
 from cura_torchrl.trainers.ray_backend import RayRollouts, ray_rollouts
 
 if TYPE_CHECKING:
@@ -39,6 +48,9 @@ LATENT_SIZE = 32
 
 class Networks(nn.Module):
     """Actor, critic and collision estimator with the normalisation of observations that they share.
+
+    With ``CURAConfig.uncertainty = "perceptual"`` there are a privileged and a perceptual estimator beside them, see
+    :class:`~cura_torchrl.objectives.PerceptualObjective`; else these are None.
 
     Args:
         config: Sizes.
@@ -67,9 +79,41 @@ class Networks(nn.Module):
             num_atoms=config.cura.num_atoms,
             hidden_sizes=sizes.collision_hidden_sizes,
             observation_norm=self.observation_norm,
+            risk_measure=make_risk_measure(config.cura.risk_measure, config.cura.risk_level),
         )
         for network in (self.actor, self.critic, self.collision_estimator):
             _ignore_latent_(network)
+        self.privileged_estimator: DistributionalCollisionEstimator | None = None
+        self.perceptual_estimator: DistributionalCollisionEstimator | None = None
+        if config.cura.uncertainty == "perceptual":
+            # After the others, which so start from the same random numbers with and without them.
+            self._add_perceptual(config)
+
+    def _add_perceptual(self, config: TrainConfig) -> None:
+        inputs, seen = OBSERVATION_SIZE + LATENT_SIZE, (keys.OBSERVATION, keys.LATENT)
+        make = functools.partial(
+            DistributionalCollisionEstimator,
+            num_atoms=config.cura.num_atoms,
+            hidden_sizes=config.network.collision_hidden_sizes,
+            observation_norm=self.observation_norm,
+        )
+        self.privileged_estimator = make(
+            inputs + CODE_SIZE,
+            # What the policy sees is part of the state: how it will act depends on it.
+            in_keys=(*seen, keys.OBSTACLE_CODE),
+            out_keys=(keys.PRIVILEGED_ATOMS, keys.PRIVILEGED_RISK, "privileged_uncertainty"),
+        )
+        self.perceptual_estimator = make(
+            inputs, in_keys=seen, out_keys=(keys.PERCEPTUAL_ATOMS, "perceptual_risk", keys.UNCERTAINTY)
+        )
+
+    @property
+    def collision_network(self) -> TensorDictModule:
+        """What writes atoms, risk and the uncertainty that the costs, logs and pictures read."""
+        if self.perceptual_estimator is None:
+            return self.collision_estimator
+        # The second overwrites the first one's uncertainty.
+        return TensorDictSequential(self.collision_estimator, self.perceptual_estimator)
 
 
 def _ignore_latent_(network: nn.Module) -> None:
@@ -92,7 +136,7 @@ def build_advantage(config: TrainConfig, networks: Networks) -> CURAAdvantage:
     ppo, cura = config.ppo, config.cura
     return CURAAdvantage(
         networks.critic,
-        networks.collision_estimator,
+        networks.collision_network,
         gamma=ppo.gamma,
         lmbda=ppo.lmbda,
         collision_gamma=cura.gamma,
@@ -133,6 +177,27 @@ def build_loss(config: TrainConfig, networks: Networks) -> CURALoss:
     )
 
 
+def build_perceptual(config: TrainConfig, networks: Networks) -> PerceptualObjective | None:
+    """Return what trains the estimators of the perceptual uncertainty.
+
+    Args:
+        config: Coefficients.
+        networks: Networks, on their device.
+
+    Returns:
+        Targets and losses; None where the networks have no such estimators.
+    """
+    if networks.privileged_estimator is None or networks.perceptual_estimator is None:
+        return None
+    return PerceptualObjective(
+        networks.privileged_estimator,
+        networks.perceptual_estimator,
+        gamma=config.cura.gamma,
+        lmbda=config.cura.lmbda,
+        seed=config.seed,
+    )
+
+
 def load_encoder(path: Path | None) -> MapVAE:
     """Return the frozen encoder of maps.
 
@@ -157,20 +222,23 @@ def load_encoder(path: Path | None) -> MapVAE:
         raise UnavailableError(msg) from None
 
 
-def make_env(config: TrainConfig, num_envs: int, *, keep_map: bool = False, **options: Any) -> TransformedEnv:
+def make_env(
+    config: TrainConfig, num_envs: int, *, keep_map: bool = False, add_obstacle_code: bool = False, **options: Any
+) -> TransformedEnv:
     """Return the environment with what the policy sees of it.
 
     Args:
         config: Environment, map and perception.
         num_envs: Number of worlds N.
         keep_map: Whether the window of the map stays in the tensordict under ``confidence_map``.
+        add_obstacle_code: Whether the true obstacles are emitted as ``obstacle_code``, for a privileged estimator.
         **options: Keyword arguments of :class:`~cura_torchrl.envs.push.PushEnv`.
 
     Returns:
         Environment that emits ``observation`` and ``latent`` beside its own keys.
     """
     env_config, lidar = config.env, config.env.lidar
-    if config.perception == "privileged":
+    if config.perception == "privileged" or add_obstacle_code:
         env_config = dataclasses.replace(env_config, task=dataclasses.replace(env_config.task, privileged=True))
     transforms: list[nn.Module] = []
     if config.perception == "map" or keep_map:
@@ -179,6 +247,8 @@ def make_env(config: TrainConfig, num_envs: int, *, keep_map: bool = False, **op
         transforms.append(EncodeMap(load_encoder(config.encoder), del_keys=not keep_map))
     else:
         transforms.append(ObstacleCode(LATENT_SIZE, is_blind=config.perception == "none"))
+    if add_obstacle_code:
+        transforms.append(ObstacleCode(CODE_SIZE, is_blind=False, out_key=keys.OBSTACLE_CODE))
     options.setdefault("seed", config.seed)
     env = PushEnv(num_envs, env_config, **options)
     return TransformedEnv(env, Compose(*transforms).to(env.device))
@@ -210,6 +280,7 @@ def make_worker_env(config: TrainConfig, num_envs: int, *, worker: int, frames_d
         episode_stride=config.num_envs,
         frames_done=frames_done,
         frames_per_step=config.num_envs,
+        add_obstacle_code=config.cura.uncertainty == "perceptual",
     )
 
 

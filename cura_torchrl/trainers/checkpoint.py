@@ -25,7 +25,7 @@ from cura_torchrl.trainers.build import Networks, make_env
 from cura_torchrl.trainers.config import TrainConfig
 from cura_torchrl.trainers.errors import CheckpointError
 from cura_torchrl.trainers.info import git_commit, shipped_methods, versions
-from cura_torchrl.trainers.methods import METHODS
+from cura_torchrl.trainers.methods import PRESETS
 from cura_torchrl.trainers.progress import PROGRESS_NAME
 from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
 
@@ -265,7 +265,7 @@ def load_policy(source: str | Path) -> LoadedPolicy:
     return LoadedPolicy(
         policy=networks.actor,
         critic=networks.critic,
-        collision_estimator=networks.collision_estimator,
+        collision_estimator=networks.collision_network,
         config=config,
         record=record,
         path=path,
@@ -321,7 +321,7 @@ def progress_path(checkpoint: Path) -> Path:
 
 
 def _resolve(source: str | Path) -> Path:
-    if isinstance(source, str) and source in METHODS:
+    if isinstance(source, str) and source in PRESETS:
         shipped = SHIPPED_FOLDER / source
         if not shipped.exists():
             available = ", ".join(shipped_methods()) or "none"
@@ -330,7 +330,7 @@ def _resolve(source: str | Path) -> Path:
         return shipped
     path = Path(source)
     if not path.exists():
-        msg = f"no checkpoint at {source}; accepted: the path of a run or checkpoint, or one of {', '.join(METHODS)}"
+        msg = f"no checkpoint at {source}; accepted: the path of a run or checkpoint, or one of {', '.join(PRESETS)}"
         raise CheckpointError(msg)
     return path
 

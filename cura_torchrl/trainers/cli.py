@@ -26,7 +26,7 @@ from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError, RunsFailedError
 from cura_torchrl.trainers.info import capabilities, git_commit, hardware, shipped_methods, versions
-from cura_torchrl.trainers.methods import METHODS, method
+from cura_torchrl.trainers.methods import PRESETS, method
 from cura_torchrl.trainers.table_config import TableConfig
 from cura_torchrl.trainers.train_all_config import PlannedRun, TrainAllConfig
 
@@ -138,7 +138,7 @@ def _complain(error: Exception, code: int) -> int:
 def _overview() -> str:
     lines = [f"  {name:<14}{(command.__doc__ or '').splitlines()[0]}" for name, command in _COMMANDS.items()]
     usage = f"usage: {PROGRAM} COMMAND [flags]; {PROGRAM} COMMAND --help lists the flags"
-    return "\n".join([usage, "", "commands:", *lines, "", f"methods: {', '.join(METHODS)}", ""])
+    return "\n".join([usage, "", "commands:", *lines, "", f"methods: {', '.join(PRESETS)}", ""])
 
 
 def _train(arguments: list[str]) -> None:

@@ -18,6 +18,8 @@ LoggerKind = Literal["csv", "tensorboard", "wandb"]
 ScriptedKind = Literal["scripted", "avoider", "random"]
 Perception = Literal["map", "none", "privileged"]
 Backend = Literal["process", "ray"]
+RiskMeasureKind = Literal["mean", "cvar", "wang"]
+UncertaintyKind = Literal["total", "perceptual"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +96,15 @@ class CURAConfig:
     """Lambda of the SR(lambda) targets [1]: 0 is one step, 1 is Monte-Carlo. Range: 0 to 1."""
     num_atoms: int = 50
     """N, atoms of the predicted distribution [1]."""
+    risk_measure: RiskMeasureKind = "mean"
+    """What of the predicted distribution the risk is: its mean (the paper), the mean of its upper tail (cvar), or its
+    mean after Wang's shift of probability to that tail (wang)."""
+    risk_level: float = 0.25
+    """Level of the risk measure [1]: for cvar alpha, the tail's share, above 0 to 1, of which 1 is the mean; for wang
+    beta, 0 or more, of which 0 is the mean. The mean has none."""
+    uncertainty: UncertaintyKind = "total"
+    """Which variance the uncertainty is: that of the predicted distribution (total, the paper), or the part of it that
+    seeing all obstacles would remove (perceptual), for which two more estimators are trained."""
     risk_floor: float = 0.005
     """Smallest standard deviation that the risk cost is divided by [1]."""
     uncertainty_floor: float = 0.005
@@ -126,6 +137,10 @@ class CURAConfig:
             require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
         for name in ("risk_coeff", "uncertainty_coeff", "costs_start_frames"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "a number that is not negative")
+        if self.risk_measure == "cvar":
+            require(0.0 < self.risk_level <= 1.0, "risk_level", self.risk_level, "above 0 to 1 for cvar")
+        if self.risk_measure == "wang":
+            require(self.risk_level >= 0.0, "risk_level", self.risk_level, "a number that is not negative for wang")
 
 
 @dataclass(frozen=True, kw_only=True)

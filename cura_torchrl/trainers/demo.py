@@ -25,7 +25,7 @@ from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError, UnavailableError
 from cura_torchrl.trainers.evaluate import summarise
 from cura_torchrl.trainers.info import git_commit, hardware, shipped_methods, versions
-from cura_torchrl.trainers.methods import METHODS
+from cura_torchrl.trainers.methods import PRESETS
 from cura_torchrl.trainers.page import Card, make_page
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.recording import Recording, choose_scenes, record
@@ -140,7 +140,7 @@ def write_pictures(folder: Path, card: Card, task: TaskConfig) -> None:
 
 def _load(name: str, config: DemoConfig) -> LoadedPolicy:
     # Where weights are missing, the one line names the command that makes them.
-    if name in METHODS and name not in shipped_methods():
+    if name in PRESETS and name not in shipped_methods():
         others = " ".join(f"runs/{other}" if other == name else other for other in config.policies)
         msg = (
             f"no weights of method {name!r} are shipped with this copy; accepted: first "
@@ -154,7 +154,7 @@ def _load(name: str, config: DemoConfig) -> LoadedPolicy:
 
 
 def _labels(loaded: Sequence[LoadedPolicy]) -> list[str]:
-    labels = [METHODS[policy.config.method].label for policy in loaded]
+    labels = [PRESETS[policy.config.method].label for policy in loaded]
     if len(set(labels)) == len(labels):
         return labels
     return [f"{label} ({policy.record['frames']:,} steps)" for label, policy in zip(labels, loaded, strict=True)]

@@ -11,7 +11,7 @@ from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDic
 
 from cura_torchrl import keys
 from cura_torchrl.modules.actor_critic import LOG_PROB_KEY
-from cura_torchrl.trainers.build import build_advantage, build_loss
+from cura_torchrl.trainers.build import build_advantage, build_loss, build_perceptual
 from cura_torchrl.trainers.diagnostics import explained_variance, find_non_finite, risk_auroc
 from cura_torchrl.trainers.errors import NonFiniteError
 
@@ -49,6 +49,7 @@ class Learner:
         self._config = config
         self._advantage = build_advantage(config, networks)
         self._loss_module = build_loss(config, networks)
+        self._perceptual = build_perceptual(config, networks)
         # Each network has its own clip, in which the largest loss would decide for all, and its own learning rate: that
         # of the actor follows its KL divergence, and with small batches falls to where a critic would not learn.
         self._parts = {
@@ -56,6 +57,10 @@ class Learner:
             "critic": _Part(networks.critic, config.ppo.critic_lr, config.ppo.max_grad_norm),
             "collision": _Part(networks.collision_estimator, config.cura.lr, config.cura.max_grad_norm),
         }
+        for name in ("privileged", "perceptual"):
+            network = getattr(networks, f"{name}_estimator")
+            if network is not None:
+                self._parts[name] = _Part(network, config.cura.lr, config.cura.max_grad_norm)
         size = min(config.ppo.minibatch_size, config.frames_per_batch)
         self._buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(config.frames_per_batch, device=config.device),
@@ -76,21 +81,26 @@ class Learner:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the counters and the state of the target's random choices.
+        """Return the counters and the state of the targets' random choices.
 
         Returns:
-            Environment steps and updates so far [1], and the generator's state.
+            Environment steps and updates so far [1], and the state of each generator.
         """
-        return {"frames": self.frames, "updates": self.updates, "generator": self._advantage.get_extra_state()}
+        state = {"frames": self.frames, "updates": self.updates, "generator": self._advantage.get_extra_state()}
+        if self._perceptual is not None:
+            state["perceptual_generator"] = self._perceptual.get_extra_state()
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Set what :meth:`state_dict` returned.
 
         Args:
-            state: Counters and the generator's state.
+            state: Counters and the state of each generator.
         """
         self.frames, self.updates = int(state["frames"]), int(state["updates"])
         self._advantage.set_extra_state(state["generator"])
+        if self._perceptual is not None:
+            self._perceptual.set_extra_state(state["perceptual_generator"])
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Train on a rollout.
@@ -108,10 +118,13 @@ class Learner:
         if bad is not None:
             msg = f"{bad} of the rollout is not finite at {self.frames} frames; the last checkpoint is intact"
             raise NonFiniteError(msg)
-        data = batch.select(*self._advantage.in_keys, *_SAMPLE_KEYS).to(self._config.device)
+        perceptual = self._perceptual
+        extra = [] if perceptual is None else perceptual.rollout_keys
+        data = batch.select(*self._advantage.in_keys, *_SAMPLE_KEYS, *extra).to(self._config.device)
         metrics = self._estimate(data)
+        extra = [] if perceptual is None else perceptual.minibatch_keys
         self._buffer.empty()
-        self._buffer.extend(data.select(*_MINIBATCH_KEYS).reshape(-1))
+        self._buffer.extend(data.select(*_MINIBATCH_KEYS, *extra).reshape(-1))
         sums: dict[str, torch.Tensor] = defaultdict(lambda: torch.zeros((), device=self._config.device))
         count = 0
         for _ in range(self._config.ppo.epochs):
@@ -135,6 +148,8 @@ class Learner:
         self._advantage.risk_coeff.fill_(cura.risk_coeff if is_trained else 0.0)
         self._advantage.uncertainty_coeff.fill_(cura.uncertainty_coeff if is_trained else 0.0)
         self._advantage(data)
+        if self._perceptual is not None:
+            self._perceptual.targets(data)
         costs = {name: value.item() for name, value in self._advantage.diagnostics(data).items()}
         return {"explained_variance": explained_variance(data), **costs, "risk_auroc": risk_auroc(data)}
 
@@ -142,6 +157,8 @@ class Learner:
         divergence = self._divergence(minibatch)
         self._adapt_rate(divergence.item())
         losses = self._loss_module(minibatch)
+        if self._perceptual is not None:
+            losses.update(self._perceptual.losses(minibatch))
         terms = {name: value for name, value in losses.items() if name.startswith("loss_")}
         total = torch.stack([value.reshape(()) for value in terms.values()]).sum()
         if not torch.isfinite(total):

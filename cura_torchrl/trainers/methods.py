@@ -1,4 +1,4 @@
-"""The paper's methods as presets: one method is one configuration of the same code."""
+"""The methods as presets, the paper's and those beyond it: one method is one configuration of the same code."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import difflib
 from dataclasses import dataclass
 
 from cura_torchrl.envs.config import MapConfig, PushEnvConfig
-from cura_torchrl.trainers.config import CURAConfig, TrainConfig
+from cura_torchrl.trainers.config import CURAConfig, RiskMeasureKind, TrainConfig, UncertaintyKind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +24,10 @@ class Method:
     """lambda_r [1]."""
     uncertainty_coeff: float
     """lambda_u [1]."""
+    risk_measure: RiskMeasureKind = "mean"
+    """What of the predicted distribution the risk is; its level is the default of ``CURAConfig.risk_level``."""
+    uncertainty: UncertaintyKind = "total"
+    """Which variance the uncertainty is."""
 
 
 METHODS: dict[str, Method] = {
@@ -40,6 +44,15 @@ METHODS: dict[str, Method] = {
 }
 """The methods by name. Both coefficients are a quarter of the paper's, for they weigh against a z-scored advantage."""
 
+EXTENSIONS: dict[str, Method] = {
+    "cura-cvar": dataclasses.replace(METHODS["cura-ppo"], label="CURA-PPO, CVaR", risk_measure="cvar"),
+    "cura-perceptual": dataclasses.replace(METHODS["cura-ppo"], label="CURA-PPO, perceptual", uncertainty="perceptual"),
+}
+"""Methods that the paper does not have: ``cura-ppo`` with one knob turned."""
+
+PRESETS = {**METHODS, **EXTENSIONS}
+"""All methods that there are by name."""
+
 CURRICULUM = ((0, 0), (40_000, 1), (150_000, 2), (2_000_000, 4), (4_000_000, 6))
 """(frames, K): the same schedule for every method, in frames and not by success, which would compare stages of it."""
 
@@ -48,7 +61,7 @@ def method(name: str) -> TrainConfig:
     """Return the configuration that trains a method.
 
     Args:
-        name: One of :data:`METHODS`.
+        name: One of :data:`PRESETS`.
 
     Returns:
         The preset.
@@ -62,12 +75,12 @@ def method(name: str) -> TrainConfig:
         >>> method("cura-ppo").cura.uncertainty_coeff
         0.25
     """
-    if name not in METHODS:
-        close = difflib.get_close_matches(name, METHODS, n=1)
+    if name not in PRESETS:
+        close = difflib.get_close_matches(name, PRESETS, n=1)
         hint = f" (did you mean {close[0]}?)" if close else ""
-        msg = f"method is {name!r}{hint}; accepted: {', '.join(METHODS)}"
+        msg = f"method is {name!r}{hint}; accepted: {', '.join(PRESETS)}"
         raise ValueError(msg)
-    preset = METHODS[name]
+    preset = PRESETS[name]
     env = PushEnvConfig()
     return TrainConfig(
         method=name,
@@ -78,5 +91,10 @@ def method(name: str) -> TrainConfig:
             task=dataclasses.replace(env.task, random_first_age=True, curriculum=CURRICULUM),
         ),
         map=MapConfig(decay=preset.decay),
-        cura=CURAConfig(risk_coeff=preset.risk_coeff, uncertainty_coeff=preset.uncertainty_coeff),
+        cura=CURAConfig(
+            risk_coeff=preset.risk_coeff,
+            uncertainty_coeff=preset.uncertainty_coeff,
+            risk_measure=preset.risk_measure,
+            uncertainty=preset.uncertainty,
+        ),
     )

@@ -10,12 +10,17 @@ from torchrl.envs.transforms import Transform
 
 from cura_torchrl import keys
 from cura_torchrl.envs.geometry import to_frame
+from cura_torchrl.envs.mdp.scenarios import OBSTACLE_SLOTS
 
 if TYPE_CHECKING:
     from tensordict import NestedKey, TensorDictBase
 
 _FAR = 10.0
 """Scale of an obstacle's position [m]."""
+
+
+CODE_SIZE = 4 * OBSTACLE_SLOTS
+"""Length of the code of all obstacles [1]."""
 
 
 class ObstacleCode(Transform):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast, get_args
 from cura_torchrl.envs.config import ScenarioKind, Simulator, require, require_finite
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.lists import Numbers, split_names
-from cura_torchrl.trainers.methods import METHODS
+from cura_torchrl.trainers.methods import PRESETS
 from cura_torchrl.trainers.paper_table import PAPER_CELLS
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class TableConfig:
         object.__setattr__(self, "cells", tuple(cell.name for cell in _cells(split_names(self.cells))))
         require(bool(self.methods), "methods", self.methods, "one or more methods")
         require(bool(self.cells), "cells", self.cells, _CELL_NAMES)
-        accepted = tuple(METHODS) if self.seeds else tuple(shipped_methods())
+        accepted = tuple(PRESETS) if self.seeds else tuple(shipped_methods())
         for name in self.methods:
             close = difflib.get_close_matches(name, accepted, n=1)
             hint = f" (did you mean {close[0]}?)" if close else ""

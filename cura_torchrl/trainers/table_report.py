@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cura_torchrl.trainers.evaluate import summarise
-from cura_torchrl.trainers.methods import METHODS
+from cura_torchrl.trainers.methods import PRESETS
 from cura_torchrl.trainers.outcomes import SHIPPED
 from cura_torchrl.trainers.paper_table import PAPER_CELLS, paper_success
 from cura_torchrl.trainers.statistics import (
@@ -243,7 +243,7 @@ def _grid(results: list[Result], dash: str, paper: str) -> list[tuple[str, ...]]
         interval = f"({100 * result.low:.1f}{dash}{100 * result.high:.1f})"
         row = rows.setdefault(result.method, [])
         row.append(f"{100 * result.success:.1f}{middle} {interval}{beside}")
-    return [(METHODS[method].label, *row) for method, row in rows.items()]
+    return [(PRESETS[method].label, *row) for method, row in rows.items()]
 
 
 def _endings(results: list[Result]) -> str:
@@ -272,7 +272,7 @@ def _differences(results: list[Result]) -> list[str]:
     if results[0].seeds > 1:
         how = "its 95 % bootstrap interval over seeds and scenes; seeds share scenes, so that there is no p"
     section = [
-        f"## Against {METHODS[BASELINE].label}",
+        f"## Against {PRESETS[BASELINE].label}",
         f"Difference of the success on the same scenes in points, {how}.",
         _rows(("Method", "Cell", "Difference", "p"), rows),
     ]
@@ -359,7 +359,7 @@ def _seed_name(seed: int) -> str:
 
 
 def _names(result: Result) -> tuple[str, str]:
-    return METHODS[result.method].label, _cell_label(result.cell)
+    return PRESETS[result.method].label, _cell_label(result.cell)
 
 
 def _with_interval(middle: float, low: float, high: float, form: str, scale: float = 1.0) -> str:

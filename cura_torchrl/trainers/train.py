@@ -31,6 +31,7 @@ from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.progress import Progress
 from cura_torchrl.trainers.ray_backend import RayRollouts, require_ray
 from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER, locked
+from cura_torchrl.trainers.warm_start import start_from
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -136,8 +137,9 @@ class _Run:
             restore(source, self.components)
         elif init_from is not None:
             start = find_checkpoint(init_from)
-            restore(start, {"networks": networks})
-            logger.info("networks start from %s", start)
+            fresh = start_from(start, networks)
+            told = f"; it has no {' and no '.join(fresh)}, which start afresh" if fresh else ""
+            logger.info("networks start from %s%s", start, told)
         self.sync()
 
     def _source(self, resume: bool) -> Path | None:

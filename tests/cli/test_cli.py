@@ -17,7 +17,7 @@ from cura_torchrl.trainers.bench_config import BenchConfig
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
-from cura_torchrl.trainers.methods import METHODS, method
+from cura_torchrl.trainers.methods import PRESETS, method
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.run_folder import is_locked
 from cura_torchrl.trainers.run_status import read_record
@@ -59,7 +59,7 @@ def test_help_lists_every_command_and_method() -> None:
     done = run("--help")
     assert done.returncode == 0
     learning = ("pretrain-map", "imitate", "train", "train-all")
-    for name in (*learning, "evaluate", "table", "release", "demo", "bench", "info", *METHODS):
+    for name in (*learning, "evaluate", "table", "release", "demo", "bench", "info", *PRESETS):
         assert name in done.stdout
 
 

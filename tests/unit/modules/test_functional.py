@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from functools import partial
 
 import pytest
@@ -13,6 +14,7 @@ from cura_torchrl.modules import (
     atom_quantile,
     atom_variance,
     conditional_value_at_risk,
+    make_risk_measure,
     quantile_midpoints,
     wang_risk,
 )
@@ -92,3 +94,32 @@ def test_measures_work_over_any_leading_shape() -> None:
         assert measure(batch).shape == (4, 2)
         assert measure(batch)[3, 0].item() == pytest.approx(measure(ATOMS).item())
     assert atom_quantile(batch, torch.tensor([0.1, 0.5, 0.9])).shape == (4, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "level", "expected"),
+    [
+        ("mean", 0.5, 0.425),  # (0.5 + 1.3 - 0.2 + 0.1) / 4, as it is
+        ("cvar", 0.5, 0.75),  # (1.0 + 0.5) / 2
+        ("cvar", 0.125, 1.0),  # half of the largest atom
+        ("cvar", 1.0, 0.4),  # (0.5 + 1.0 + 0.0 + 0.1) / 4
+        ("wang", 0.0, 0.4),
+    ],
+)
+def test_measures_by_name_keep_the_tail_inside_the_range_of_the_possibility(
+    kind: str, level: float, expected: float
+) -> None:
+    """Catches a level that is not passed on, and a risk above 1, which no discounted indicator can have."""
+    measure = pickle.loads(pickle.dumps(make_risk_measure(kind, level)))
+    assert measure(torch.tensor([0.5, 1.3, -0.2, 0.1])).item() == pytest.approx(expected)
+
+
+def test_wang_by_name_has_the_level_as_its_shift() -> None:
+    """Catches CVaR under Wang's name: the upper one of two atoms weighs 1 - Phi(-1) = 0.8413."""
+    assert make_risk_measure("wang", 1.0)(torch.tensor([1.0, 0.0])).item() == pytest.approx(0.8413, abs=1e-4)
+
+
+def test_an_unknown_measure_is_refused() -> None:
+    """Catches a wrong name that falls back to the mean."""
+    with pytest.raises(ValueError, match="risk measure is 'var'; accepted: mean, cvar, wang"):
+        make_risk_measure("var")

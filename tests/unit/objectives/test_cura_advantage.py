@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives.value import GAE
 
-from cura_torchrl.modules import DistributionalCollisionEstimator, make_critic
+from cura_torchrl.modules import DistributionalCollisionEstimator, make_critic, make_risk_measure
 from cura_torchrl.objectives import CURAAdvantage
 
 ENVS, STEPS = 6, 16
@@ -93,6 +93,28 @@ def test_the_penalised_advantage_is_the_one_worked_out_by_hand() -> None:
     expected = torch.tensor([1.0, 2.0, 6.0], dtype=torch.float64) - 0.25 * risk_cost - 1.0 * uncertainty_cost
     advantage = estimate(_table_rollout())["advantage"].flatten().double()
     assert torch.allclose(advantage, expected, atol=1e-5)
+
+
+def test_the_risk_cost_is_that_of_the_estimator_s_risk_measure() -> None:
+    """Catches a risk cost of the mean whatever the estimator calls risk.
+
+    Two atoms, of which CVaR of the upper half is the larger: R = 0.4, 0.8, 0.5, and the last is not looked at.
+    C^R = 0.9 * 0.8 - 0.4, 0.9 * 0.5 - 0.8, 1 - 0.5 = 0.32, -0.35, 0.5. The mean would give 0.25, -0.23, 0.7.
+    """
+    estimator = DistributionalCollisionEstimator(
+        2, num_atoms=2, hidden_sizes=(), in_keys=["observation"], risk_measure=make_risk_measure("cvar", 0.5)
+    )
+    weight, bias = estimator.parameters()
+    nn.init.eye_(weight)
+    nn.init.zeros_(bias)
+    atoms = torch.tensor([[[0.0, 0.4], [0.8, 0.2], [0.1, 0.5], [0.9, 0.9]]])
+    rollout = _table_rollout()
+    rollout["observation"], rollout["next", "observation"] = atoms[:, :3], atoms[:, 1:]
+    options = {"gamma": 0.0, "lmbda": 0.0, "normalise_sum": False}
+    estimate = CURAAdvantage(_zero_critic(), estimator, risk_coeff=0.5, uncertainty_coeff=0.0, **options)
+    cost = torch.tensor([0.32, -0.35, 0.5])
+    expected = torch.tensor([1.0, 2.0, 6.0]) - 0.5 * (cost - cost.mean()) / cost.std(correction=0)
+    torch.testing.assert_close(estimate(rollout)["advantage"].flatten(), expected)
 
 
 def test_costs_can_be_accumulated_along_the_trajectory() -> None:

@@ -14,7 +14,7 @@ from cura_torchrl.trainers import build as module
 from cura_torchrl.trainers.build import LATENT_SIZE, Networks, load_encoder, make_env, make_worker_env
 from cura_torchrl.trainers.errors import UnavailableError
 from cura_torchrl.trainers.methods import method
-from cura_torchrl.trainers.privileged import ObstacleCode
+from cura_torchrl.trainers.privileged import CODE_SIZE, ObstacleCode
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -43,6 +43,33 @@ def test_networks_share_one_normalisation() -> None:
     networks = Networks(method("push"))
     for network in (networks.actor, networks.critic, networks.collision_estimator):
         assert any(part is networks.observation_norm for part in network.modules())
+
+
+def test_only_training_of_the_perceptual_uncertainty_shows_the_obstacles() -> None:
+    """Catches a policy that cannot be evaluated without the true obstacles, and a run that asks for them in vain."""
+    for name, is_shown in (("cura-ppo", False), ("cura-cvar", False), ("cura-perceptual", True)):
+        config = method(name).replace(perception="none", simulator="planar")
+        training, playing = make_worker_env(config, 1, worker=0, frames_done=0), make_env(config, 1)
+        try:
+            assert ("obstacle_code" in set(training.reset().keys())) == is_shown
+            assert not {"obstacle_code", "obstacles"} & set(playing.reset().keys())
+            if is_shown:
+                assert training.rollout(2)["next", "obstacle_code"].shape == (1, 2, CODE_SIZE)
+        finally:
+            training.close()
+            playing.close()
+
+
+def test_the_perceptual_uncertainty_stands_in_for_the_total_one() -> None:
+    """Catches a policy whose costs, logs and pictures still read the total variance."""
+    networks = Networks(method("cura-perceptual"))
+    seen = TensorDict({"observation": torch.randn(5, 33), "latent": torch.randn(5, LATENT_SIZE)}, [5])
+    total, outputs = networks.collision_estimator(seen.clone()), networks.collision_network(seen.clone())
+    for key in ("collision_atoms", "risk"):
+        assert torch.equal(outputs[key], total[key])
+    expected = outputs["perceptual_atoms"].double().var(-1, correction=0, keepdim=True)
+    torch.testing.assert_close(outputs["uncertainty"].double(), expected, rtol=1e-4, atol=1e-8)
+    assert not torch.equal(outputs["uncertainty"], total["uncertainty"])
 
 
 @pytest.mark.parametrize("content", [None, b"", b"not weights"])

@@ -221,6 +221,26 @@ def test_a_policy_plays_on_either_simulator_whatever_it_was_trained_on(tmp_path:
         env.close()
 
 
+@pytest.mark.parametrize("name", ["cura-cvar", "cura-perceptual"])
+def test_methods_beyond_the_paper_play_without_what_they_were_trained_with(tmp_path: Path, name: str) -> None:
+    """Catches an evaluation that needs the true obstacles, or reads another risk than the policy was trained by."""
+    config = method(name).replace(run_dir=tmp_path / "run", perception="none", simulator="planar")
+    save_checkpoint({"networks": Networks(config)}, config, tmp_path / "run", frames=1)
+    loaded = load_policy(tmp_path / "run")
+    env = loaded.make_env(2)
+    try:
+        played = env.rollout(2, loaded.policy)
+    finally:
+        env.close()
+    assert not {"obstacle_code", "obstacles"} & set(played.keys())
+    outputs = loaded.collision_estimator(played.select("observation", "latent"))
+    atoms = outputs["collision_atoms"].clamp(0, 1).sort(-1, descending=True).values
+    # The largest quarter of 50 atoms: 12 and half of the next.
+    tail = (atoms[..., :12].sum(-1) + 0.5 * atoms[..., 12]) / 12.5
+    expected = tail if name == "cura-cvar" else outputs["collision_atoms"].mean(-1)
+    torch.testing.assert_close(outputs["risk"].squeeze(-1), expected)
+
+
 def _outputs(value: torch.Tensor | tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
     return value if isinstance(value, tuple) else (value,)
 

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cura_torchrl.envs.config import PushEnvConfig
-from cura_torchrl.trainers.config import EvaluateConfig, PPOConfig, TrainConfig
-from cura_torchrl.trainers.methods import METHODS, method
+from cura_torchrl.trainers.config import CURAConfig, EvaluateConfig, PPOConfig, TrainConfig
+from cura_torchrl.trainers.methods import PRESETS, method
 
 FINITE = st.floats(min_value=1e-6, max_value=1.0, allow_nan=False)
 
@@ -21,7 +21,7 @@ FINITE = st.floats(min_value=1e-6, max_value=1.0, allow_nan=False)
 @st.composite
 def train_configs(draw: st.DrawFn) -> TrainConfig:
     """Any method's preset with fields of every type changed."""
-    preset = method(draw(st.sampled_from(list(METHODS))))
+    preset = method(draw(st.sampled_from(list(PRESETS))))
     workers = draw(st.integers(1, 4))
     steps = draw(st.lists(st.integers(0, 10**9), max_size=4, unique=True).map(sorted))
     task = dataclasses.replace(
@@ -107,6 +107,16 @@ def test_optimisation_settings_out_of_range_are_refused(changes: dict[str, float
     """Catches a run that cannot adapt its learning rate."""
     with pytest.raises(ValueError, match="accepted"):
         PPOConfig(**changes)
+
+
+@pytest.mark.parametrize(
+    ("kind", "level", "accepted"),
+    [("cvar", 0.0, "above 0 to 1"), ("cvar", 1.5, "above 0 to 1"), ("wang", -0.1, "a number that is not negative")],
+)
+def test_a_risk_level_that_its_measure_does_not_have_is_refused(kind: str, level: float, accepted: str) -> None:
+    """Catches a tail of nothing, and a shift towards what is harmless, before a run starts."""
+    with pytest.raises(ValueError, match=f"risk_level is {level}; accepted: {accepted}"):
+        CURAConfig(risk_measure=kind, risk_level=level)
 
 
 @pytest.mark.parametrize("given_", [{}, {"method": "push", "policy": "random"}, {"method": "push", "episodes": 0}])

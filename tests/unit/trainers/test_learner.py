@@ -17,6 +17,7 @@ from cura_torchrl.trainers.config import PPOConfig, TrainConfig
 from cura_torchrl.trainers.errors import NonFiniteError
 from cura_torchrl.trainers.learner import Learner, adapted_rate, gaussian_divergence
 from cura_torchrl.trainers.methods import method
+from cura_torchrl.trainers.privileged import CODE_SIZE
 
 ROWS, STEPS = 4, 16
 
@@ -38,6 +39,7 @@ def rollout(learner: Learner) -> TensorDict:
     """A rollout of noise in which the second row collides."""
     shape = (ROWS, STEPS)
     seen = {"observation": 2 + 3 * torch.randn(*shape, OBSERVATION_SIZE), "latent": torch.randn(*shape, LATENT_SIZE)}
+    seen["obstacle_code"] = torch.rand(*shape, CODE_SIZE)
     batch = TensorDict(seen, shape)
     with torch.no_grad():
         learner.networks.actor(batch)
@@ -46,6 +48,7 @@ def rollout(learner: Learner) -> TensorDict:
     after = {
         "observation": seen["observation"].roll(-1, 1),
         "latent": seen["latent"].roll(-1, 1),
+        "obstacle_code": seen["obstacle_code"].roll(-1, 1),
         "reward": torch.randn(*shape, 1),
         "cost": hit.float(),
         "done": hit,
@@ -104,11 +107,22 @@ def test_the_critic_keeps_its_rate_when_that_of_the_actor_falls() -> None:
     assert rates["collision_optimizer"] == config.cura.lr
 
 
-def test_an_update_changes_all_networks_and_reports_finite_numbers() -> None:
-    """Catches a network that no optimiser holds."""
-    _, learner = build()
-    networks = learner.networks
-    parts = (networks.actor, networks.critic, networks.collision_estimator)
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("cura-ppo", ("actor", "critic", "collision_estimator")),
+        ("cura-cvar", ("actor", "critic", "collision_estimator")),
+        (
+            "cura-perceptual",
+            ("actor", "critic", "collision_estimator", "privileged_estimator", "perceptual_estimator"),
+        ),
+    ],
+)
+def test_an_update_changes_all_networks_and_reports_finite_numbers(name: str, parts: tuple[str, ...]) -> None:
+    """Catches a network that no optimiser holds, and one that a method does not need."""
+    _, learner = build(name)
+    assert {name.split(".")[0] for name, _ in learner.networks.named_parameters()} == set(parts)
+    parts = [getattr(learner.networks, part) for part in parts]
     before = [flat(part.parameters()) for part in parts]
     metrics = learner.update(rollout(learner))
     for part, old in zip(parts, before, strict=True):
@@ -154,14 +168,32 @@ def test_a_number_that_is_not_finite_stops_the_step_and_leaves_the_weights(key: 
     assert torch.equal(flat(learner.networks.parameters()), before)
 
 
-def test_a_learner_that_is_restored_goes_on_as_if_it_had_not_stopped() -> None:
+def test_without_costs_the_estimators_beyond_the_paper_change_nothing_else() -> None:
+    """Catches an estimator whose first weights, random choices or gradients reach actor or critic."""
+    results = []
+    for name in ("cura-ppo", "cura-perceptual"):
+        torch.manual_seed(5)
+        config, _ = build(name)
+        config = config.replace(cura=dataclasses.replace(config.cura, risk_coeff=0.0, uncertainty_coeff=0.0))
+        torch.manual_seed(5)
+        networks = Networks(config)
+        torch.manual_seed(6)
+        learner = Learner(config, networks)
+        learner.update(rollout(learner))
+        parts = (networks.actor, networks.critic, networks.collision_estimator)
+        results.append([flat(part.parameters()) for part in parts])
+    assert all(torch.equal(one, other) for one, other in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("name", ["cura-ppo", "cura-perceptual"])
+def test_a_learner_that_is_restored_goes_on_as_if_it_had_not_stopped(name: str) -> None:
     """Catches state that no checkpoint holds: optimisers, learning rate, the targets' random choices."""
-    _, learner = build()
+    _, learner = build(name)
     batches = [rollout(learner) for _ in range(2)]
     learner.update(batches[0])
-    _, other = build()
-    for name, component in learner.components().items():
-        other.components()[name].load_state_dict(copy.deepcopy(component.state_dict()))
+    _, other = build(name)
+    for key, component in learner.components().items():
+        other.components()[key].load_state_dict(copy.deepcopy(component.state_dict()))
     results = []
     for one in (learner, other):
         torch.manual_seed(3)  # the minibatches' order, which the checkpoint's global generator restores

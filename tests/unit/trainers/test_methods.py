@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from cura_torchrl.trainers.methods import METHODS, method
+from cura_torchrl.trainers.methods import EXTENSIONS, METHODS, PRESETS, method
 
 # Paper, Sec. V: (object hides what is behind it, alpha, lambda_r, lambda_u); alpha = 1 is a map without confidence.
 PAPER = {
@@ -56,6 +56,25 @@ def test_methods_differ_in_nothing_else() -> None:
 def test_all_listed_methods_are_the_paper_s() -> None:
     """Catches a method that is offered but not checked here."""
     assert set(METHODS) == set(PAPER)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [("cura-cvar", {"risk_measure": "cvar"}), ("cura-perceptual", {"uncertainty": "perceptual"})],
+)
+def test_a_method_beyond_the_paper_turns_one_knob_of_cura_ppo(name: str, changes: dict[str, str]) -> None:
+    """Catches a comparison that does not tell what made the difference."""
+    base = method("cura-ppo")
+    assert method(name) == base.replace(method=name, cura=dataclasses.replace(base.cura, **changes))
+    assert base.cura.risk_measure == "mean"
+    assert base.cura.uncertainty == "total"
+
+
+def test_methods_beyond_the_paper_stand_apart() -> None:
+    """Catches one that is counted among the paper's, or that hides one of them."""
+    assert set(EXTENSIONS) == {"cura-cvar", "cura-perceptual"}
+    assert not set(EXTENSIONS) & set(METHODS)
+    assert list(PRESETS) == [*METHODS, *EXTENSIONS]
 
 
 def test_an_unknown_name_is_refused_with_the_names_there_are() -> None:

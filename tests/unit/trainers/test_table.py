@@ -232,5 +232,6 @@ def test_a_setting_that_makes_no_sense_is_refused_in_one_line(changes: dict[str,
 
 def test_names_may_be_joined_by_commas() -> None:
     """Catches a list that is read as one name, and a cell that is spelt in two ways and played twice."""
+    assert TableConfig(methods=("cura-cvar,cura-perceptual",), seeds=(0,)).methods == ("cura-cvar", "cura-perceptual")
     config = TableConfig(methods=("push,cura-ppo",), cells=("all", "uniform-1,uniform-1.0"))
     assert (config.methods, config.cells) == (("push", "cura-ppo"), PAPER_CELLS)

@@ -109,6 +109,19 @@ def test_networks_may_start_from_another_run(config: TrainConfig, tmp_path: Path
     assert (before.learner.frames, source.learner.frames) == (0, 2 * FRAMES)
 
 
+def test_a_perceptual_run_starts_from_a_method_of_the_paper_and_says_what_is_new(
+    config: TrainConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Catches a fine-tuning that does not start, or does not tell that its estimators know nothing yet."""
+    train(config)
+    cura = dataclasses.replace(config.cura, uncertainty="perceptual")
+    perceptual = config.replace(method="cura-perceptual", cura=cura, run_dir=tmp_path / "second", total_frames=FRAMES)
+    with caplog.at_level("INFO"):
+        checkpoint = train(perceptual, init_from=config.run_dir)
+    assert "it has no privileged_estimator and no perceptual_estimator, which start afresh" in caplog.text
+    assert train(perceptual.replace(total_frames=2 * FRAMES), resume=True).name > checkpoint.name
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_run_with_a_checkpoint(
     config: TrainConfig, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
