@@ -213,7 +213,9 @@ def _write_graph(module: nn.Module, signals: tuple[list[Signal], list[Signal]], 
         node.meta.pop("stack_trace", None)  # paths of this machine
     torch.export.save(program, stem.with_suffix(".pt2"))
     for name in ("torch.onnx", "onnxscript", "onnx_ir"):
-        logging.getLogger(name).setLevel(logging.ERROR)  # torchvision, which nothing here needs, is missing; and the like
+        logging.getLogger(name).setLevel(
+            logging.ERROR
+        )  # torchvision, which nothing here needs, is missing; and the like
     names = [[signal.name for signal in side] for side in signals]
     options: dict[str, Any] = {"dynamo": True, "external_data": False, "verbose": False}
     exported = torch.onnx.export(program, input_names=names[0], output_names=names[1], **options)

@@ -48,9 +48,7 @@ class Runner:
     def reset(self) -> None:
         """Forget what was seen: before every episode."""
         start = self.description["initial_state"]
-        self._state = {
-            name: np.full(self._shapes[name], start[name], dtype=np.float32) for name in ("stamps", "steps")
-        }
+        self._state = {name: np.full(self._shapes[name], start[name], dtype=np.float32) for name in ("stamps", "steps")}
 
     def step(
         self,

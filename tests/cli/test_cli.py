@@ -17,6 +17,7 @@ from cura_torchrl.trainers.bench_config import BenchConfig
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
+from cura_torchrl.trainers.export_config import ExportConfig
 from cura_torchrl.trainers.methods import METHODS, method
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.table_config import TableConfig
@@ -55,7 +56,19 @@ def test_help_lists_every_command_and_method() -> None:
     """Catches a command that nobody finds."""
     done = run("--help")
     assert done.returncode == 0
-    for name in ("pretrain-map", "imitate", "train", "evaluate", "table", "release", "demo", "bench", "info", *METHODS):
+    for name in (
+        "pretrain-map",
+        "imitate",
+        "train",
+        "evaluate",
+        "table",
+        "release",
+        "export",
+        "demo",
+        "bench",
+        "info",
+        *METHODS,
+    ):
         assert name in done.stdout
 
 
@@ -66,6 +79,7 @@ def test_help_lists_every_command_and_method() -> None:
         ("evaluate", EvaluateConfig),
         ("table", TableConfig),
         ("demo", DemoConfig),
+        ("export", ExportConfig),
         ("bench", BenchConfig),
     ],
 )
@@ -107,6 +121,9 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
             ["evaluate", "--method", "cura"],
             "method is 'cura' (did you mean cura-ppo?)",
         ),
+        (["export"], "policy to export is []; accepted: one of checkpoint, method"),
+        (["export", "--method", "cura"], "method is 'cura'"),
+        (["export", "--method", "push", "--out", "/"], "out is '/'; accepted: a folder that is empty or not there"),
         (["table", "--methods", "push,cura"], "method is 'cura'; accepted: cura-no-risk, "),
         (["table", "--cells", "uniform-0.5", "uniform-9"], "cell is 'uniform-9'; accepted: all, or SCENARIO-SIZE"),
         (["table", "--methods", "push", "--seeds", "7", "--runs", "{tmp}", "--out", "{tmp}"], "no checkpoint at"),

@@ -154,7 +154,7 @@ class ConfidenceMap(Transform):
         stamps = self._stamps.new_zeros(num_rows, *self._stamps.shape[1:])
         return stamps, self._steps.new_full((num_rows,), self._start)
 
-    def advance(  # noqa: PLR0913 - one argument per input
+    def advance(
         self,
         stamps: torch.Tensor,
         steps: torch.Tensor,
