@@ -1,8 +1,8 @@
 """The pushing task with somebody else's learner: PPO of Stable-Baselines3, through ``gymnasium.make``.
 
-What the policy sees is what ours see: robot, box and goal, and the code of the confidence map. The cost of a collision is
-in ``info``, and this learner has no use for it. Worlds are played one after the other, which is the price of Gymnasium's
-interface. Needs `pip install cura-torchrl[gym] stable-baselines3`.
+What the policy sees is what ours see: robot, box and goal, and the code of the confidence map. The cost of a collision
+is in ``info``, and this learner has no use for it. Worlds are played one after the other, which is the price of
+Gymnasium's interface. Needs ``pip install cura-torchrl[gym] stable-baselines3``.
 
 python examples/push_with_stable_baselines3.py
 """

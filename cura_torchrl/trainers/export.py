@@ -1,8 +1,8 @@
 """Writes a trained policy as graphs that run without this package: ONNX for a robot, ``torch.export`` for PyTorch.
 
-Two graphs: ``map`` takes a scan and the map so far and returns the map and the window around the robot; ``policy`` takes
-the window and the observation and returns the action and what the collision estimator predicts. An export is compared
-with PyTorch on recorded observations before it appears, and holds that recording.
+Two graphs: ``map`` takes a scan and the map so far and returns the map and the window around the robot; ``policy``
+takes the window and the observation and returns the action and what the collision estimator predicts. An export is
+compared with PyTorch on recorded observations before it appears, and holds that recording.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ import importlib.util
 import json
 import logging
 import shutil
+import warnings
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -174,9 +176,11 @@ def record(map_graph: MapGraph, policy_graph: PolicyGraph, loaded: LoadedPolicy,
         Arrays by name, one row a step.
     """
     rows: dict[str, list[NDArray[Any]]] = {}
+    memory: list[torch.Tensor] = []
     for is_first, state in observations(loaded, steps):
         sensed = {name: state[name].float() for name in (*_SENSED, keys.OBSERVATION)}
-        memory = map_graph.transform.initial_state(1) if is_first else memory
+        if is_first:
+            memory = list(map_graph.transform.initial_state(1))
         with torch.no_grad():
             *memory, window = map_graph(*memory, *(sensed[name] for name in _SENSED))
             action, _, atoms, risk, uncertainty = policy_graph(window, sensed[keys.OBSERVATION])
@@ -197,7 +201,8 @@ def _fill(stage: Path, loaded: LoadedPolicy, check_steps: int) -> None:
         _write_graph(policy_graph, policy_signals(transform, loaded.config.cura.num_atoms), stage / "policy")
         bar.update()
         bar.set_description("recording")
-        np.savez_compressed(stage / "recording.npz", **record(map_graph, policy_graph, loaded, check_steps))
+        recording: dict[str, Any] = record(map_graph, policy_graph, loaded, check_steps)
+        np.savez_compressed(stage / "recording.npz", **recording)
         bar.update()
         bar.set_description("comparison")
         shutil.copyfile(RUNNER, stage / RUNNER.name)
@@ -212,21 +217,35 @@ def _write_graph(module: nn.Module, signals: tuple[list[Signal], list[Signal]], 
     for node in program.graph_module.graph.nodes:
         node.meta.pop("stack_trace", None)  # paths of this machine
     torch.export.save(program, stem.with_suffix(".pt2"))
-    for name in ("torch.onnx", "onnxscript", "onnx_ir"):
-        logging.getLogger(name).setLevel(
-            logging.ERROR
-        )  # torchvision, which nothing here needs, is missing; and the like
     names = [[signal.name for signal in side] for side in signals]
     options: dict[str, Any] = {"dynamo": True, "external_data": False, "verbose": False}
-    exported = torch.onnx.export(program, input_names=names[0], output_names=names[1], **options)
+    with _quiet():
+        exported = torch.onnx.export(program, input_names=names[0], output_names=names[1], **options)
     if exported is None:
         msg = f"graph of {stem.name} was not made; accepted: an exporter that returns it"
         raise RunError(msg)
     exported.save(stem.with_suffix(".onnx"))
 
 
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence what the exporter tells of itself: its own deprecations, torchvision that nothing needs, folded nodes."""
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.ERROR)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)
+            warnings.simplefilter("ignore", DeprecationWarning)
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
 def _describe(stage: Path, loaded: LoadedPolicy, transform: ConfidenceMap) -> None:
-    """Write the description, once the graphs agree with PyTorch."""
+    """Write the description; raises RunError where the graphs differ from PyTorch."""
     path, description = stage / "export.json", describe(loaded, transform)
     path.write_text(json.dumps(description), encoding="utf-8")
     runner = importlib.import_module("cura_torchrl.trainers.runner")

@@ -56,19 +56,8 @@ def test_help_lists_every_command_and_method() -> None:
     """Catches a command that nobody finds."""
     done = run("--help")
     assert done.returncode == 0
-    for name in (
-        "pretrain-map",
-        "imitate",
-        "train",
-        "evaluate",
-        "table",
-        "release",
-        "export",
-        "demo",
-        "bench",
-        "info",
-        *METHODS,
-    ):
+    commands = ["pretrain-map", "imitate", "train", "evaluate", "table", "release", "export", "demo", "bench", "info"]
+    for name in (*commands, *METHODS):
         assert name in done.stdout
 
 

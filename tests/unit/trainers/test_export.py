@@ -138,7 +138,7 @@ def test_reset_forgets(runner: Runner) -> None:
 def test_runner_refuses_what_it_would_take_for_free_space(runner: Runner) -> None:
     """Catches a pose that is not a number, and a scan of another LiDAR."""
     good = {"pose": np.zeros(3), "object_pose": np.ones(3), "object_size": np.ones(2), "observation": np.zeros(33)}
-    with pytest.raises(ValueError, match="sensor_pose is .*; accepted: finite numbers"):
+    with pytest.raises(ValueError, match=r"sensor_pose is .*; accepted: finite numbers"):
         runner.step(np.ones(360), **{**good, "pose": [np.nan, 0.0, 0.0]})
     with pytest.raises(ValueError, match="scan has 720 numbers; accepted: 360"):
         runner.step(np.ones(720), **good)
@@ -179,5 +179,5 @@ def test_what_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.Monk
 def test_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
     """Catches an export that replaces what somebody kept there."""
     (tmp_path / "notes").write_text("mine", encoding="utf-8")
-    with pytest.raises(ValueError, match="out is .*; accepted: a folder that is empty or not there"):
+    with pytest.raises(ValueError, match=r"out is .*; accepted: a folder that is empty or not there"):
         ExportConfig(method="push", out=tmp_path)

@@ -76,7 +76,8 @@ def test_sees_what_the_method_sees(name: str) -> None:
     """Catches a code of another map: the methods differ in decay and occlusion."""
     preset = method(name)
     task = dataclasses.replace(preset.env.task, curriculum=(), random_first_age=False)
-    inner = make_env(preset.replace(env=dataclasses.replace(preset.env, task=task, simulator="planar")), 1, seed=5)
+    played = dataclasses.replace(preset.env, task=task, simulator="planar")
+    inner = make_env(preset.replace(env=played, simulator="planar"), 1, seed=5)
     expected = inner.reset(episodes=torch.tensor([4]))["latent"][0].numpy()
     env = PushGym(method=name, simulator="planar")
     observation, _ = env.reset(seed=5, options={"scenario": 4})
@@ -129,6 +130,5 @@ def test_gymnasium_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> 
         raise ModuleNotFoundError(name)
 
     monkeypatch.setattr(importlib, "import_module", refuse)
-    registration = importlib.sys.modules["cura_torchrl.trainers.gym_registration"]
     with pytest.raises(UnavailableError, match=r"cura-torchrl\[gym\]"):
-        registration.register_gym()
+        register_gym()
