@@ -78,7 +78,9 @@ class PolicyGraph(nn.Module):
 
     def __init__(self, loaded: LoadedPolicy) -> None:
         super().__init__()
-        self.encoder = load_encoder(loaded.config.encoder).requires_grad_(False)
+        # Channels last, as the encoder comes, torch.export stores with a warning.
+        encoder = load_encoder(loaded.config.encoder).requires_grad_(False)
+        self.encoder = encoder.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
         self.actor = loaded.policy[0].module
         self.collision_estimator = loaded.collision_estimator.module
 
@@ -245,7 +247,11 @@ def _quiet() -> Iterator[None]:
 
 
 def _describe(stage: Path, loaded: LoadedPolicy, transform: ConfidenceMap) -> None:
-    """Write the description; raises RunError where the graphs differ from PyTorch."""
+    """Write the description, once the graphs agree with PyTorch.
+
+    Raises:
+        RunError: If they do not.
+    """
     path, description = stage / "export.json", describe(loaded, transform)
     path.write_text(json.dumps(description), encoding="utf-8")
     runner = importlib.import_module("cura_torchrl.trainers.runner")

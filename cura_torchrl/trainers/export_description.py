@@ -151,8 +151,8 @@ def _actions(robot: RobotConfig) -> dict[str, Any]:
         "frame": "base",
         "low": -1.0,
         "high": 1.0,
-        "meaning": "velocities as shares of scale, the end-effector's relative to the base; (base_x, base_y) is shortened "
-        "to length 1",
+        "meaning": "velocities as shares of scale, the end-effector's relative to the base; (base_x, base_y) is "
+        "shortened to length 1",
         "parts": [{"name": name, "scale": scale, "unit": unit} for name, (scale, unit) in speeds.items()],
     }
 

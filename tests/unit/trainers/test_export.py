@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import importlib.util
 import json
+import logging
 import os
 import shutil
 import subprocess
@@ -30,8 +31,11 @@ SENSED = ("scan", "sensor_pose", "object_pose", "object_size", "observation")
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An export of the shipped method."""
-    return module.export(ExportConfig(method="cura-ppo", out=tmp_path_factory.mktemp("export") / "out", check_steps=3))
+    """An export of the shipped method; pytest would keep, and format, what PyTorch traces for its debugging."""
+    logging.disable(logging.DEBUG)
+    out = module.export(ExportConfig(method="cura-ppo", out=tmp_path_factory.mktemp("export") / "out", check_steps=3))
+    logging.disable(logging.NOTSET)
+    return out
 
 
 @pytest.fixture
