@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from cura_torchrl.modules import DistributionalCollisionEstimator, MapVAE
     from cura_torchrl.objectives import CURAAdvantage, CURALoss
     from cura_torchrl.trainers.checkpoint import load_policy
+    from cura_torchrl.trainers.gym_registration import register_gym
 
 __version__ = "0.1.0"
 
@@ -31,6 +32,7 @@ _SOURCES = {
     "CURAAdvantage": "cura_torchrl.objectives",
     "CURALoss": "cura_torchrl.objectives",
     "load_policy": "cura_torchrl.trainers.checkpoint",
+    "register_gym": "cura_torchrl.trainers.gym_registration",
 }
 
 __all__ = [
@@ -43,6 +45,7 @@ __all__ = [
     "PushEnv",
     "__version__",
     "load_policy",
+    "register_gym",
 ]
 
 

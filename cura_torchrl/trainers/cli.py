@@ -25,6 +25,7 @@ from cura_torchrl.trainers.bench_config import BenchConfig
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError, RunsFailedError
+from cura_torchrl.trainers.export_config import ExportConfig
 from cura_torchrl.trainers.info import capabilities, git_commit, hardware, shipped_methods, versions
 from cura_torchrl.trainers.methods import PRESETS, method
 from cura_torchrl.trainers.table_config import TableConfig
@@ -202,6 +203,16 @@ def _release(arguments: list[str]) -> None:
     sys.stdout.write(f"{folder}\n")
 
 
+def _export(arguments: list[str]) -> None:
+    """Write a policy as ONNX and torch.export graphs, with a runner for a robot."""
+    config = _parse(ExportConfig, "export", arguments)
+    _require_path(config.checkpoint)
+    module = _import("cura_torchrl.trainers.export")
+    with _clean_stdout():
+        folder = module.export(config)
+    sys.stdout.write(f"{folder}\n")
+
+
 def _bench(arguments: list[str]) -> None:
     """Measure how fast the parts are, as ratios."""
     options = _parse(BenchOptions, "bench", arguments)
@@ -352,6 +363,7 @@ _COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "evaluate": _evaluate,
     "table": _table,
     "release": _release,
+    "export": _export,
     "demo": _demo,
     "bench": _bench,
     "info": _info,

@@ -17,6 +17,7 @@ from cura_torchrl.trainers.bench_config import BenchConfig
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
+from cura_torchrl.trainers.export_config import ExportConfig
 from cura_torchrl.trainers.methods import PRESETS, method
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.run_folder import is_locked
@@ -59,7 +60,8 @@ def test_help_lists_every_command_and_method() -> None:
     done = run("--help")
     assert done.returncode == 0
     learning = ("pretrain-map", "imitate", "train", "train-all")
-    for name in (*learning, "evaluate", "table", "release", "demo", "bench", "info", *PRESETS):
+    others = ("evaluate", "table", "release", "export", "demo", "bench", "info")
+    for name in (*learning, *others, *PRESETS):
         assert name in done.stdout
 
 
@@ -71,6 +73,7 @@ def test_help_lists_every_command_and_method() -> None:
         ("evaluate", EvaluateConfig),
         ("table", TableConfig),
         ("demo", DemoConfig),
+        ("export", ExportConfig),
         ("bench", BenchConfig),
     ],
 )
@@ -112,6 +115,9 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
             ["evaluate", "--method", "cura"],
             "method is 'cura' (did you mean cura-ppo?)",
         ),
+        (["export"], "policy to export is []; accepted: one of checkpoint, method"),
+        (["export", "--method", "cura"], "method is 'cura'"),
+        (["export", "--method", "push", "--out", "/"], "out is '/'; accepted: a folder that is empty or not there"),
         (["table", "--methods", "push,cura"], "method is 'cura'; accepted: cura-no-risk, "),
         (["table", "--cells", "uniform-0.5", "uniform-9"], "cell is 'uniform-9'; accepted: all, or SCENARIO-SIZE"),
         (["table", "--methods", "push", "--seeds", "7", "--runs", "{tmp}", "--out", "{tmp}"], "no checkpoint at"),

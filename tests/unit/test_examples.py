@@ -27,6 +27,7 @@ REACHED = {
     "a_method_of_ones_own": r"last rollout: reward (\S+) a step, bonus (\S+), collisions (\S+)% of steps",
     "cura_on_gymnasium": r"last \d+ episodes: return (\S+) of at most 200, (\S+)% ended by spinning too fast",
     "plain_ppo": r"reward a step: (\S+) in the first rollout, (\S+) in the last",
+    "push_with_stable_baselines3": r"reward a step: (\S+) in the first rollout, (\S+) in the last",
     "train_in_a_loop": r"reward (\S+) a step, collisions (\S+)% of steps",
 }
 """What a script says in the end, or on its progress bar, of what it has reached."""

@@ -23,6 +23,7 @@ from cura_torchrl.envs.transforms.reset_mask import reset_mask
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from types import ModuleType
 
     from tensordict import NestedKey
 
@@ -140,6 +141,53 @@ class ConfidenceMap(Transform):
         """Channels of the window."""
         return 2 if self.config.channels == "confidence+occupancy" else 1
 
+    def initial_state(self, num_rows: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the maps of the start of an episode, in which nothing has been seen.
+
+        Args:
+            num_rows: Number of maps N.
+
+        Returns:
+            Stored maps [1], shape ``[N, num_rows, num_columns]`` of the grid, and the time before the first scan [1],
+            shape ``[N]``.
+        """
+        stamps = self._stamps.new_zeros(num_rows, *self._stamps.shape[1:])
+        return stamps, self._steps.new_full((num_rows,), self._start)
+
+    def advance(
+        self,
+        stamps: torch.Tensor,
+        steps: torch.Tensor,
+        scan: torch.Tensor,
+        sensor_pose: torch.Tensor,
+        object_pose: torch.Tensor,
+        object_size: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Integrate one scan into maps that the caller keeps: a pure function of tensor operations, for export.
+
+        Args:
+            stamps: Stored maps as from :meth:`initial_state`, or as returned.
+            steps: Their time [1], shape ``[N]``.
+            scan: Ranges [m], shape ``[N, R]``.
+            sensor_pose: Sensor (x [m], y [m], yaw [rad]), world frame, finite, shape ``[N, 3]``.
+            object_pose: Object's centre (x [m], y [m], yaw [rad]), world frame, finite, shape ``[N, 3]``.
+            object_size: Object's footprint (length, width) [m], shape ``[N, 2]``.
+
+        Returns:
+            The maps and their time after the scan, and the windows, shape ``[N, C, W, W]``.
+
+        Examples:
+            >>> transform = ConfidenceMap(MapConfig(window=4), num_rays=8, max_range=10.0)
+            >>> far, size = torch.full((1, 3), 99.0), torch.ones(1, 2)
+            >>> state = transform.initial_state(1)
+            >>> *state, window = transform.advance(*state, torch.full((1, 8), 5.0), torch.zeros(1, 3), far, size)
+            >>> window.shape, window[:, 0].unique().tolist()
+            (torch.Size([1, 2, 4, 4]), [1.0])
+        """
+        stamps, steps = stamps.clone(), steps + 1
+        inputs = [visibility.clean_scan(scan, self.max_range), sensor_pose, object_pose, object_size]
+        return stamps, steps, self._integrate(map_tensors, stamps, steps, inputs)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Integrate one more scan and write the window.
 
@@ -174,8 +222,7 @@ class ConfidenceMap(Transform):
             self._stamps = torch.zeros(num_rows, *self._stamps.shape[1:], device=device)
             self._steps = torch.full((num_rows,), self._start, device=device)
         rows = mask.nonzero().squeeze(-1)
-        stamps = self._stamps.new_zeros(rows.numel(), *self._stamps.shape[1:])
-        steps = self._steps.new_full((rows.numel(),), self._start)
+        stamps, steps = self.initial_state(rows.numel())
         fresh = self._observe(stamps, steps, [item[rows] for item in inputs])
         self._stamps[rows], self._steps[rows] = stamps, steps
         window = fresh.new_zeros(num_rows, *fresh.shape[1:])
@@ -212,14 +259,22 @@ class ConfidenceMap(Transform):
         scan, pose = visibility.clean_scan(inputs[0], self.max_range), inputs[1].contiguous()
         torch._assert_async(pose.isfinite().all(), "a sensor's pose is out of bounds: accepted are finite numbers")
         cells = map_kernels if scan.device.type == "cpu" else map_tensors
+        return self._integrate(cells, stamps, steps, [scan, pose, *inputs[2:]])
+
+    def _integrate(
+        self, cells: ModuleType, stamps: torch.Tensor, steps: torch.Tensor, inputs: list[torch.Tensor]
+    ) -> torch.Tensor:
+        """Return the windows after a clean scan is integrated into ``stamps``, in place, at the time ``steps``."""
+        scan, pose, object_pose, object_size = inputs
         cells.mark_free((self._row_x, self._column_y), stamps, steps, scan, pose, self.grid.half_diagonal)
         # Half a cell below the maximum is five times the LiDAR's noise: a noisy miss is no obstacle.
         longest = self.max_range - 0.5 * self.config.resolution
-        rectangles = (pose, self._robot_size.expand(len(pose), 2), inputs[2], inputs[3] + 2.0 * self.config.resolution)
+        known = object_size + 2.0 * self.config.resolution
+        rectangles = (pose, self._robot_size.expand(len(pose), 2), object_pose, known)
         cells.mark_hits(self.grid, stamps, steps, scan, self._directions, rectangles, longest)
         frames = (
             window.map_frame(self.grid, self._offsets, pose),
-            window.footprint_frame(self._offsets, pose, inputs[2], inputs[3]),
+            window.footprint_frame(self._offsets, pose, object_pose, object_size),
         )
         channels = 1 if self.config.channels == "confidence" else 2
         windows = scan.new_empty(len(scan), channels, self.config.window, self.config.window)

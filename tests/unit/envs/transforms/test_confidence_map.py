@@ -54,6 +54,28 @@ class TestContract(TransformContract):
         return ScanEnv(labels)
 
 
+class TestAdvance:
+    """The map's update as a pure function."""
+
+    def test_gives_the_windows_of_the_transform_and_changes_no_input(self) -> None:
+        """Catches another order of the inputs, a scan that is not cleaned, and state that is changed in place."""
+        transform = make_map()
+        scans = scan_of([(2.0, 0.0, 0.0, 0.4, 0.4), (-1.0, 1.5, 0.3, 0.4, 0.4)])
+        scans["scan"][0, 3] = float("nan")
+        scans["object_pose"], scans["object_size"] = torch.tensor([[2.0, 0.0, 0.0]]), torch.full((1, 2), 0.4)
+        state = transform.initial_state(1)
+        for _ in range(3):
+            scans["sensor_pose"] = scans["sensor_pose"] + torch.tensor([[0.11, -0.07, 0.2]])
+            before = [value.clone() for value in state]
+            inputs = [scans[key] for key in ("scan", "sensor_pose", "object_pose", "object_size")]
+            *after, window = transform.advance(*state, *inputs)
+            assert all(torch.equal(value, kept) for value, kept in zip(state, before, strict=True))
+            expected = transform(scans.clone())["confidence_map"]
+            assert expected[:, 1].any()
+            assert (window != expected).float().mean() < 1e-3  # cells between two rays may ask either
+            state = after
+
+
 class TestDefinition:
     """The whole transform against the slow reference."""
 
