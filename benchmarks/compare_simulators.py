@@ -1,6 +1,6 @@
 """Print how the success rates of the same policies on the same scenes differ between the two simulators, as Markdown.
 
-Reads what ``evaluate --json`` printed:
+Reads two files of outcomes that ``cura-torchrl table`` wrote, or two folders of what ``evaluate --json`` printed:
 python benchmarks/compare_simulators.py benchmarks/results/bullet benchmarks/results/planar
 """
 
@@ -8,27 +8,48 @@ from __future__ import annotations
 
 import argparse
 import json
+import sqlite3
+from collections import defaultdict
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from results_table import SIZES, successes
+import numpy as np
 
 from cura_torchrl.trainers.statistics import paired_difference
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+Scene = tuple[str, str, int, float, int, int]
+"""Method, scenario, K, size [m], seed of the scenes and index."""
 
 
-def read(folder: Path) -> dict[tuple[str, str, int, float], dict[str, Any]]:
-    """Return the results of a folder that say how each scene ended, by method, scenario, K and size."""
+def read(path: Path) -> dict[Scene, bool]:
+    """Return whether each scene was solved, from a file of outcomes or a folder of JSON files."""
+    return read_folder(path) if path.is_dir() else read_store(path)
+
+
+def read_folder(folder: Path) -> dict[Scene, bool]:
+    """Return whether each scene was solved, from the results that say how each one ended."""
     results = [json.loads(file.read_text(encoding="utf-8")) for file in sorted(folder.glob("*.json"))]
-    paired = [result for result in results if "outcomes" in result]
-    return {(r["method"], r["scenario"], r["max_obstacles"], r["object_size"]): r for r in paired}
+    return {
+        (r["method"], r["scenario"], r["max_obstacles"], r["object_size"], r["seed"], index): letter == "s"
+        for r in results
+        for index, letter in enumerate(r.get("outcomes", ""))
+    }
 
 
-def row(name: str, one: NDArray[np.bool_], other: NDArray[np.bool_]) -> str:
+def read_store(path: Path) -> dict[Scene, bool]:
+    """Return whether each scene was solved by a policy that is shipped."""
+    # Training seed -1 stands for shipped weights.
+    query = (
+        "SELECT method, scenario, max_obstacles, object_size, scene_seed, scene_index, outcome FROM outcomes"
+        " WHERE training_seed = -1"
+    )
+    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
+        return {tuple(scene): outcome == "s" for *scene, outcome in database.execute(query)}
+
+
+def row(name: str, pairs: list[tuple[bool, bool]]) -> str:
     """Return a row of the table: rates of both simulators, scene by scene, and their difference in points."""
+    one, other = np.array(pairs).T
     middle, low, high = (100 * value for value in paired_difference(one, other))
     rates = " | ".join(f"{100 * own.mean():.1f} ({len(own)})" for own in (one, other))
     return f"| {name} | {rates} | {middle:+.1f} ({low:+.1f} to {high:+.1f}) |"
@@ -37,17 +58,16 @@ def row(name: str, one: NDArray[np.bool_], other: NDArray[np.bool_]) -> str:
 def main() -> None:
     """Parse the command line and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", type=Path, nargs=2, help="results on PyBullet, results on the planar simulator")
-    bullet, planar = (read(folder) for folder in parser.parse_args().folders)
+    parser.add_argument("results", type=Path, nargs=2, help="those on PyBullet, those on the planar simulator")
+    bullet, planar = (read(path) for path in parser.parse_args().results)
     print("| Policy, size | PyBullet [%] (episodes) | planar [%] (episodes) | difference [points] (95 % interval) |")
     print("|---|---|---|---|")
-    shared = [key for key in bullet if key in planar]
-    for method in sorted({key[0] for key in shared}):
-        for size in SIZES:
-            keys = [key for key in shared if key[0] == method and key[3] == size]
-            if keys:
-                pair = (successes([results[key] for key in keys]) for results in (bullet, planar))
-                print(row(f"{method}, {size} m, {len(keys)} cells", *pair))
+    groups: dict[tuple[str, float], list[Scene]] = defaultdict(list)
+    for scene in bullet.keys() & planar.keys():
+        groups[scene[0], scene[3]].append(scene)
+    for (method, size), scenes in sorted(groups.items()):
+        cells = len({scene[1:3] for scene in scenes})
+        print(row(f"{method}, {size} m, {cells} cells", [(bullet[scene], planar[scene]) for scene in scenes]))
 
 
 if __name__ == "__main__":

@@ -98,6 +98,53 @@ def obstacles_hit(
     return hit.any(-1) & (obstacles[..., 3] > 0)
 
 
+class Sightings:
+    """When obstacles appear, and when a ray first hits them, in the episodes that N worlds play.
+
+    Args:
+        max_range: What a ray of the LiDAR that hits nothing reads [m].
+    """
+
+    def __init__(self, max_range: float) -> None:
+        self._max_range = max_range
+        self._episode = torch.empty(0)
+        self._elapsed = torch.empty(0)
+        self.appeared = torch.empty(0)
+        """Policy step of the episode in which each obstacle appeared [1], NaN before, shape ``[N, M]``."""
+        self.seen = torch.empty(0)
+        """Policy step in which a ray first hit it [1], NaN before, shape ``[N, M]``."""
+        self.is_fresh = torch.empty(0, dtype=torch.bool)
+        """Rows in which the last state was the first of an episode, bool, shape ``[N]``."""
+
+    def update(self, state: TensorDictBase, playing: torch.Tensor) -> torch.Tensor:
+        """Note what a state says.
+
+        Args:
+            state: What the environment emits, with the true obstacles, batch size ``[N]``.
+            playing: Rows that count, bool, shape ``[N]``.
+
+        Returns:
+            Which obstacles are hit for the first time, bool, shape ``[N, M]``.
+        """
+        obstacles, elapsed, episode = state[keys.OBSTACLES], state[keys.ELAPSED_STEPS].float(), state[keys.EPISODE]
+        if self._episode.shape != episode.shape:
+            self._episode, self._elapsed = torch.full_like(episode, -1), elapsed
+            self.appeared = torch.full_like(obstacles[..., 0], torch.nan)
+            self.seen = self.appeared
+        fresh = (episode != self._episode) | (elapsed < self._elapsed)
+        self._episode, self._elapsed, self.is_fresh = episode.clone(), elapsed, fresh[:, 0]
+        is_there = playing[:, None] & (obstacles[..., 3] > 0)
+        appeared, seen = (times.masked_fill(fresh, torch.nan) for times in (self.appeared, self.seen))
+        self.appeared = torch.where(is_there & appeared.isnan(), elapsed, appeared)
+        rows, slots = (is_there & seen.isnan()).nonzero(as_tuple=True)
+        first = torch.zeros_like(is_there)
+        if len(rows):
+            scan, pose = state[keys.SCAN][rows], state[keys.SENSOR_POSE][rows]
+            first[rows, slots] = obstacles_hit(scan, pose, obstacles[rows, slots][:, None], self._max_range)[:, 0]
+        self.seen = torch.where(first, elapsed, seen)
+        return first
+
+
 class LookingMeter:
     """Measure how much is looked while episodes are played, as the ``watch`` of :func:`~.evaluate.play_episodes`.
 
@@ -109,15 +156,13 @@ class LookingMeter:
 
     def __init__(self, env: TransformedEnv, lidar: LidarConfig, period: float) -> None:
         env.append_transform(sight_map(lidar))
-        self._lidar, self._period = lidar, period
+        self._period = period
         self._beside: list[torch.Tensor] = []
         self._unseen: list[torch.Tensor] = []
         self._speed: list[torch.Tensor] = []
         self._waits: list[torch.Tensor] = []
         self._distances: list[torch.Tensor] = []
-        self._episode = torch.empty(0)
-        self._appeared = torch.empty(0)
-        self._is_known = torch.empty(0, dtype=torch.bool)
+        self._sightings = Sightings(lidar.max_range)
 
     def watch(self, state: TensorDictBase, playing: torch.Tensor) -> None:
         """Note what a state says.
@@ -139,24 +184,10 @@ class LookingMeter:
         self._note_sightings(state, playing)
 
     def _note_sightings(self, state: TensorDictBase, playing: torch.Tensor) -> None:
-        obstacles, elapsed = state[keys.OBSTACLES], state[keys.ELAPSED_STEPS].float()
-        episode = state[keys.EPISODE]
-        if len(self._episode) != len(episode):
-            self._episode = torch.full_like(episode, -1)
-            self._appeared = torch.full_like(obstacles[..., 0], torch.nan)
-            self._is_known = torch.zeros_like(self._appeared, dtype=torch.bool)
-        fresh = (episode != self._episode).expand_as(self._appeared)
-        self._episode = episode.clone()
-        self._appeared = self._appeared.masked_fill(fresh, torch.nan)
-        self._is_known = self._is_known & ~fresh
-        is_new = (obstacles[..., 3] > 0) & self._appeared.isnan()
-        self._appeared = torch.where(is_new, elapsed.expand_as(self._appeared), self._appeared)
-        hit = obstacles_hit(state[keys.SCAN], state[keys.SENSOR_POSE], obstacles, self._lidar.max_range)
-        first = hit & ~self._is_known & playing[:, None]
-        self._waits.append((self._period * (elapsed - self._appeared))[first])
-        away = geometry.norm(obstacles[..., :2] - state[keys.OBJECT_POSE][:, None, :2])
+        first = self._sightings.update(state, playing)
+        self._waits.append((self._period * (self._sightings.seen - self._sightings.appeared))[first])
+        away = geometry.norm(state[keys.OBSTACLES][..., :2] - state[keys.OBJECT_POSE][:, None, :2])
         self._distances.append(away[first])
-        self._is_known = self._is_known | hit
 
     def summary(self) -> dict[str, float]:
         """Return the measures.

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import multiprocessing
+import itertools
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,18 +20,20 @@ from cura_torchrl.envs.config import PushEnvConfig
 from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.envs.robots import scripted
 from cura_torchrl.trainers.checkpoint import load_policy
+from cura_torchrl.trainers.config import EvaluateConfig
+from cura_torchrl.trainers.episode_measures import EpisodeMeter, Measures
 from cura_torchrl.trainers.info import git_commit, versions
 from cura_torchrl.trainers.statistics import wilson_interval
 from cura_torchrl.trainers.threads import one_thread
+from cura_torchrl.trainers.worker_pool import count_one, in_processes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
     from cura_torchrl.envs.config import TaskConfig
-    from cura_torchrl.trainers.config import EvaluateConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +52,24 @@ class Episode:
     """The object tipped over."""
     steps: int
     """Policy steps until goal, collision or time-out [1]."""
+    measures: Measures | None = None
+    """What was measured of it; None where nothing was."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """What one process plays at a time: always the same scenes in the same rows, so that results are the same too."""
+
+    config: EvaluateConfig
+    """Policy and scenarios."""
+    index: int
+    """Index of the part [1]; how many there are depends on the configuration alone."""
+
+    @property
+    def indices(self) -> range:
+        """Scenarios of the part."""
+        first = self.index * part_size(self.config)
+        return range(first, min(first + part_size(self.config), self.config.episodes))
 
 
 def evaluate(config: EvaluateConfig) -> dict[str, Any]:
@@ -69,12 +88,11 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
     episodes: list[Episode] = []
     with tqdm(total=config.episodes, unit="episode", file=sys.stderr) as bar:
 
-        def add(episode: Episode) -> None:
-            episodes.append(episode)
-            bar.update()
-            bar.set_postfix_str(f"success {sum(played.success[0] for played in episodes) / len(episodes):.1%}")
+        def keep(_: Part, played: list[Episode]) -> None:
+            episodes.extend(played)
+            bar.set_postfix_str(f"success {sum(entry.success[0] for entry in episodes) / len(episodes):.1%}")
 
-        _play_all(config, add)
+        play_parts(parts_of(config), config.num_workers, keep=keep, tick=bar.update)
     return {**source, **summarise(episodes), **_settings(config)}
 
 
@@ -132,24 +150,31 @@ class Player:
     """
 
     def __init__(self, config: EvaluateConfig) -> None:
-        self._config = config
         self._env, self._policy = _build(config)
 
     def close(self) -> None:
         """Close the worlds."""
         self._env.close()
 
-    def play(self, part: int, report: Callable[[Episode], object]) -> None:
+    def play(self, part: Part, report: Callable[[Episode], object]) -> list[Episode]:
         """Play one part of the scenarios, each once.
 
         Args:
-            part: Index of the part; how many there are depends on the configuration alone.
+            part: Which part.
             report: Called with every episode when it is over.
+
+        Returns:
+            How they were played, by index.
         """
-        first = part * part_size(self._config)
-        last = min(first + part_size(self._config), self._config.episodes)
-        torch.manual_seed(self._config.seed * 1_000_003 + part)  # random actions only; all else is deterministic
-        play_episodes(self._env, self._policy, torch.arange(first, last), report=report)
+        config = self._env.config
+        # Random actions only; all else is deterministic.
+        torch.manual_seed(part.config.seed * 1_000_003 + part.index)
+        meter = EpisodeMeter(period=config.task.policy_period, max_range=config.lidar.max_range)
+        return play_episodes(self._env, self._policy, torch.tensor(part.indices), report=report, meter=meter)
+
+
+def _ignore(*_: object) -> None:
+    """Watch nothing."""
 
 
 @torch.no_grad()
@@ -158,8 +183,9 @@ def play_episodes(
     policy: Callable[[TensorDictBase], TensorDictBase],
     indices: torch.Tensor,
     *,
-    report: Callable[[Episode], object] | None = None,
-    watch: Callable[[TensorDictBase, torch.Tensor], object] | None = None,
+    report: Callable[[Episode], object] = _ignore,
+    watch: Callable[[TensorDictBase, torch.Tensor], object] = _ignore,
+    meter: EpisodeMeter | None = None,
 ) -> list[Episode]:
     """Play scenarios, each once, with the policy's mean action.
 
@@ -173,6 +199,7 @@ def play_episodes(
         report: Called with every episode when it is over.
         watch: Called with what the environment emits at the start and after every step, batch size ``[N]``, and with
             the rows that were being played until then, bool, shape ``[N]``.
+        meter: Measures the episodes; it needs an environment with ``TaskConfig.privileged``.
 
     Returns:
         How they were played, in the order of ``indices``.
@@ -182,33 +209,35 @@ def play_episodes(
     playing = torch.tensor([next(waiting, -1) for _ in range(num_worlds)])
     reached = torch.zeros(num_worlds, dtype=torch.int64)
     outcomes: dict[int, Episode] = {}
+    measure = _ignore if meter is None else meter.watch
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         state = env.reset(episodes=indices[playing.clamp_min(0)])
-        if watch is not None:
-            watch(state, playing >= 0)
+        watch(state, playing >= 0)
+        measure(state, playing >= 0)
         while len(outcomes) < len(indices):
             state = policy(state)
             state[keys.ACTION] = torch.where(playing.unsqueeze(-1) < 0, 0.0, state[keys.ACTION])
             after = env.step(state)["next"]
-            if watch is not None:
-                watch(after, playing >= 0)
+            watch(after, playing >= 0)
+            measure(after, (playing >= 0) & (reached == 0))
             is_new = after[keys.SUCCESS][:, 0] & (reached == 0)
             reached = torch.where(is_new, after[keys.ELAPSED_STEPS].squeeze(-1), reached)
             has_ended = after["done"].squeeze(-1) & (playing >= 0)
             for row in has_ended.nonzero().flatten().tolist():
                 number = int(playing[row])
-                outcomes[number] = _episode(int(indices[number]), after[row], int(reached[row]))
-                if report is not None:
-                    report(outcomes[number])
+                measures = None if meter is None else meter.measures(after, row)
+                outcomes[number] = _episode(int(indices[number]), after[row], int(reached[row]), measures)
+                report(outcomes[number])
                 playing[row], reached[row] = next(waiting, -1), 0
             state = step_mdp(state)
             is_fresh = has_ended & (playing >= 0)
             if is_fresh.any():
                 state = env.reset(state.set("_reset", is_fresh[:, None]), episodes=indices[playing.clamp_min(0)])
+                measure(state, is_fresh)
     return [outcomes[number] for number in range(len(indices))]
 
 
-def _episode(index: int, last: TensorDictBase, reached: int) -> Episode:
+def _episode(index: int, last: TensorDictBase, reached: int, measures: Measures | None) -> Episode:
     success = tuple(last[keys.SUCCESS].tolist())
     contact = tuple(last[keys.CONTACT].tolist())
     return Episode(
@@ -218,6 +247,7 @@ def _episode(index: int, last: TensorDictBase, reached: int) -> Episode:
         contact=contact,
         tipped=bool(last[keys.TIPPED]),
         steps=reached or int(last[keys.ELAPSED_STEPS]),
+        measures=measures,
     )
 
 
@@ -233,34 +263,49 @@ def part_size(config: EvaluateConfig) -> int:
     return 5 * config.chunk
 
 
-def _play_all(config: EvaluateConfig, report: Callable[[Episode], object]) -> None:
-    parts = range(-(-config.episodes // part_size(config)))
-    if config.num_workers == 1:
-        with one_thread(), closing(Player(config)) as player:
-            for part in parts:
-                player.play(part, report)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(config.num_workers, len(parts)), mp_context=context) as pool:
-        for played in pool.map(functools.partial(play_in_worker, config), parts):
-            for episode in played:
-                report(episode)
-
-
-def play_in_worker(config: EvaluateConfig, part: int) -> list[Episode]:
-    """Play one part of the scenarios, with worlds that this process keeps for the next part.
+def parts_of(config: EvaluateConfig) -> list[Part]:
+    """Return the parts of the scenarios.
 
     Args:
         config: Policy and scenarios.
-        part: Index of the part.
 
     Returns:
-        How they were played, as they ended.
+        The parts, by index.
     """
-    played: list[Episode] = []
+    return [Part(config=config, index=index) for index in range(-(-config.episodes // part_size(config)))]
+
+
+def play_parts(
+    parts: Sequence[Part],
+    num_workers: int,
+    *,
+    keep: Callable[[Part, list[Episode]], object],
+    tick: Callable[[int], object],
+) -> None:
+    """Play parts, here or in processes; results do not depend on which.
+
+    Args:
+        parts: What to play; those of one configuration follow each other.
+        num_workers: Processes that play [1]; with one, it is this process.
+        keep: Called with each part when it is over, and with its episodes by index.
+        tick: Called with the number of episodes that were over since it was called last [1].
+
+    Raises:
+        WorkerError: If a process that plays has died.
+    """  # noqa: DOC502 - raised by what this calls
+    if num_workers > 1 and parts:
+        in_processes(_play_in_worker, parts, num_workers, keep=keep, tick=tick)
+        return
+    for config, group in itertools.groupby(parts, key=lambda part: part.config):
+        with one_thread(), closing(Player(config)) as player:
+            for part in group:
+                keep(part, player.play(part, lambda _: tick(1)))
+
+
+def _play_in_worker(part: Part) -> list[Episode]:
     with one_thread():
-        _worker_player(config).play(part, played.append)
-    return played
+        # The worlds are kept for the next part.
+        return _worker_player(part.config).play(part, lambda _: count_one())
 
 
 @functools.lru_cache(maxsize=1)
@@ -276,8 +321,7 @@ def _build(config: EvaluateConfig) -> tuple[EnvBase, Callable[[TensorDictBase], 
         env = loaded.make_env(config.chunk, task=task, simulator=config.simulator, seed=config.seed)
         return env, loaded.policy
     base = PushEnvConfig(simulator=config.simulator)
-    task = dataclasses.replace(_task(base.task, config), privileged=config.policy == "avoider")
-    env = PushEnv(config.chunk, dataclasses.replace(base, task=task), seed=config.seed)
+    env = PushEnv(config.chunk, dataclasses.replace(base, task=_task(base.task, config)), seed=config.seed)
     if config.policy == "random":
         return env, env.rand_action
     return env, (scripted.ScriptedPusher if config.policy == "scripted" else scripted.ScriptedAvoider)(base.robot)
@@ -304,7 +348,10 @@ def _task(task: TaskConfig, config: EvaluateConfig) -> TaskConfig:
     scenario = dataclasses.replace(
         task.scenario, kind=config.scenario, object_edges=(config.object_size,), max_obstacles=config.max_obstacles
     )
-    return dataclasses.replace(task, scenario=scenario, stream="eval", random_first_age=False, curriculum=())
+    # The obstacles are there for the meter; a policy reads them only if it says so.
+    return dataclasses.replace(
+        task, scenario=scenario, stream="eval", random_first_age=False, curriculum=(), privileged=True
+    )
 
 
 def _settings(config: EvaluateConfig) -> dict[str, Any]:

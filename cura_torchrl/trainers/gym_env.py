@@ -40,7 +40,7 @@ class PushGym(gymnasium.Env):
     ``reset(options={"scenario": i})`` plays the i-th.
 
     Args:
-        method: Whose map and LiDAR: a name in :data:`cura_torchrl.trainers.methods.METHODS`.
+        method: Whose map and LiDAR: a name in :data:`cura_torchrl.trainers.methods.PRESETS`.
         simulator: Where the world is.
         scenario: Where obstacles appear.
         max_obstacles: Most obstacles K in an episode [1]. Range: 0 to 6.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,6 +17,7 @@ from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.robots import ridgeback_franka as model
 from cura_torchrl.modules.functional import atom_mean, atom_variance
+from cura_torchrl.trainers.episode_measures import bodies, clearance
 from cura_torchrl.trainers.evaluate import Episode, play_episodes
 
 if TYPE_CHECKING:
@@ -118,14 +118,9 @@ class Recording:
     @cached_property
     def clearance(self) -> NDArray[np.float64]:
         """Distance from chassis, arm and object to the nearest obstacle [m], shape ``[T]``; infinite without one."""
-        pose, half = self._bodies()
-        obstacles = torch.from_numpy(self.obstacles).double()
-        edge = obstacles[:, None, :, 3]
-        obstacle_half = (edge / 2).unsqueeze(-1).expand(-1, -1, -1, 2)
-        distance = geometry.rectangle_distance(
-            pose[:, :, None], half[:, :, None], obstacles[:, None, :, :3], obstacle_half
-        )
-        return torch.where(edge > 0, distance, math.inf).flatten(1).amin(1).numpy()
+        base, tcp, pushed = (torch.from_numpy(track).double() for track in (self.base_pose, self.tcp, self.object_pose))
+        pose, half = bodies(base, tcp, pushed, base.new_full((len(base),), self.scene.object_edge))
+        return clearance(pose[:, None], half[:, None], torch.from_numpy(self.obstacles).double()).amin(1).numpy()
 
     @property
     def min_clearance(self) -> float:
@@ -170,19 +165,6 @@ class Recording:
             touched = zip(("base", "arm", "object"), self.episode.contact, strict=True)
             return f"collision of the {' and '.join(name for name, hit in touched if hit)} after {self.end_time:.1f} s"
         return f"time-out after {self.end_time:.0f} s, {self.final_distance:.1f} m from the goal"
-
-    def _bodies(self) -> tuple[torch.Tensor, torch.Tensor]:
-        # Chassis, arm and object as rectangles: poses [T, 3, 3] and half extents [T, 3, 2].
-        base, tcp = torch.from_numpy(self.base_pose).double(), torch.from_numpy(self.tcp).double()
-        chassis_half = base.new_tensor(model.CHASSIS_SIZE) / 2
-        front = geometry.from_frame(base, torch.stack([chassis_half[0], base.new_tensor(0.0)]).expand(len(base), 2))
-        reach = tcp - front
-        arm = torch.cat([(front + tcp) / 2, geometry.angle_of(reach)[:, None]], -1)
-        length = geometry.norm(reach)
-        arm_half = torch.stack([length / 2, torch.full_like(length, scenarios.ARM_HALF_WIDTH)], -1)
-        object_half = base.new_full((len(base), 2), self.scene.object_edge / 2)
-        pose = torch.stack([base, arm, torch.from_numpy(self.object_pose).double()], 1)
-        return pose, torch.stack([chassis_half.expand(len(base), 2), arm_half, object_half], 1)
 
 
 def choose_scenes(config: ScenarioConfig, *, seed: int, count: int) -> list[Scene]:

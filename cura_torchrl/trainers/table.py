@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import itertools
-import multiprocessing
-import os
 import sys
-import threading
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,17 +13,22 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
+from cura_torchrl.trainers.agreement import agreement, pair
 from cura_torchrl.trainers.checkpoint import SUMS_NAME, load_policy
 from cura_torchrl.trainers.config import EvaluateConfig
-from cura_torchrl.trainers.errors import CheckpointError, WorkerError
-from cura_torchrl.trainers.evaluate import Episode, Player, part_size, play_in_worker
-from cura_torchrl.trainers.outcomes import SHIPPED, OutcomeStore, PolicyRecord, Scenes
-from cura_torchrl.trainers.table_config import TableConfig, parse_cell
-from cura_torchrl.trainers.table_report import as_csv, as_latex, as_markdown, compare
-from cura_torchrl.trainers.threads import one_thread
+from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
+from cura_torchrl.trainers.evaluate import Episode, Part, parts_of, play_parts
+from cura_torchrl.trainers.info import git_commit, versions
+from cura_torchrl.trainers.outcomes import SHIPPED, CodeRecord, OutcomeStore, PolicyRecord, Scenes
+from cura_torchrl.trainers.table_config import CHUNKS, TableConfig, parse_cell
+from cura_torchrl.trainers.table_figure import table_figure
+from cura_torchrl.trainers.table_numbers import Result, compare
+from cura_torchrl.trainers.table_parquet import write_parquet
+from cura_torchrl.trainers.table_report import agreement_section, as_csv, as_latex, as_markdown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from cura_torchrl.trainers.agreement import Agreement
+    from cura_torchrl.trainers.table_numbers import Played
 
 STORE_NAME = "outcomes.sqlite"
 """File of outcomes in the table's folder."""
@@ -41,25 +42,12 @@ class _Policy:
     path: Path
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Part:
-    """What one process plays at a time and one transaction writes."""
-
-    scenes: Scenes
-    config: EvaluateConfig
-    index: int
-
-    @property
-    def indices(self) -> range:
-        first = self.index * part_size(self.config)
-        return range(first, min(first + part_size(self.config), self.config.episodes))
-
-
 def table(config: TableConfig) -> str:
     """Play what the folder's file of outcomes does not hold yet, and write the table.
 
     Args:
-        config: Methods, cells and number of scenes. Writes ``table.md``, ``table.csv`` and ``table.tex`` to its folder.
+        config: Methods, cells and number of scenes. Writes the table to its folder as ``table.md``, ``.csv``, ``.tex``,
+            ``.png`` and ``.svg``; with pyarrow also as ``.parquet``, and the file of outcomes as ``outcomes.parquet``.
 
     Returns:
         The table in Markdown, as it was written.
@@ -70,7 +58,9 @@ def table(config: TableConfig) -> str:
         WorkerError: If a process that plays has died; what was played until then is kept.
     """  # noqa: DOC502 - raised by what this calls
     policies = _policies(config)
-    with closing(OutcomeStore(config.out / STORE_NAME, chunk=config.chunk)) as store:
+    if config.compare_with is not None:
+        OutcomeStore(config.compare_with, chunk=None).close()  # raises before anything is played
+    with closing(OutcomeStore(config.out / STORE_NAME, chunk=config.side_by_side)) as store:
         for policy in policies:
             store.register(policy.record)
         _play(config, store, policies)
@@ -94,46 +84,50 @@ def _policies(config: TableConfig) -> list[_Policy]:
 
 def _play(config: TableConfig, store: OutcomeStore, policies: list[_Policy]) -> None:
     """Play the parts that the store does not hold, and write each when it is over."""
-    parts = [part for policy in policies for cell in config.cells for part in _open_parts(config, store, policy, cell)]
-    total = len(policies) * len(config.cells) * config.episodes
+    scenes = {
+        _settings(config, policy, cell): _scenes(config, policy.record, cell)
+        for policy in policies
+        for cell in config.cells
+    }
+    parts = [part for settings, where in scenes.items() for part in _open_parts(settings, store, where)]
+    code = CodeRecord(commit=git_commit(), versions=versions())
+    total = len(scenes) * config.episodes
     done = total - sum(len(part.indices) for part in parts)
     with tqdm(total=total, initial=done, unit="episode", file=sys.stderr) as bar:
 
-        def keep(part: _Part, episodes: list[Episode]) -> None:
-            store.add(part.scenes, episodes)
-            bar.update(len(episodes))
-            bar.set_postfix_str(f"{part.scenes.method}, {part.scenes.scenario} {part.scenes.object_size} m")
+        def keep(part: Part, episodes: list[Episode]) -> None:
+            where = scenes[part.config]
+            store.add(where, episodes, code)
+            bar.set_postfix_str(f"{where.method}, {where.scenario} {where.object_size} m")
 
-        if config.num_workers == 1:
-            _play_here(parts, keep)
-        elif parts:
-            _play_in_processes(parts, min(config.num_workers, len(parts)), keep)
+        play_parts(parts, config.num_workers, keep=keep, tick=bar.update)
 
 
-def _open_parts(config: TableConfig, store: OutcomeStore, policy: _Policy, name: str) -> list[_Part]:
-    """Return the parts of a cell that have scenes without an outcome."""
-    scenes, played_by = _scenes(config, policy.record.method, policy.record.training_seed, name), policy.path
-    settings = EvaluateConfig(
-        checkpoint=played_by,
-        scenario=parse_cell(name).scenario,
-        object_size=scenes.object_size,
+def _settings(config: TableConfig, policy: _Policy, name: str) -> EvaluateConfig:
+    cell = parse_cell(name)
+    return EvaluateConfig(
+        checkpoint=policy.path,
+        scenario=cell.scenario,
+        object_size=cell.object_size,
         max_obstacles=config.max_obstacles,
         episodes=config.episodes,
         seed=config.seed,
         simulator=config.simulator,
-        chunk=config.chunk,
+        chunk=config.side_by_side,
     )
-    known = {episode.index for episode in store.read(scenes, config.episodes)}
-    count = -(-config.episodes // part_size(settings))
-    parts = (_Part(scenes=scenes, config=settings, index=index) for index in range(count))
-    return [part for part in parts if not known.issuperset(part.indices)]
 
 
-def _scenes(config: TableConfig, method: str, training_seed: int, name: str) -> Scenes:
+def _open_parts(settings: EvaluateConfig, store: OutcomeStore, scenes: Scenes) -> list[Part]:
+    """Return the parts of a cell that have scenes without an outcome."""
+    known = {episode.index for episode in store.read(scenes, settings.episodes)}
+    return [part for part in parts_of(settings) if not known.issuperset(part.indices)]
+
+
+def _scenes(config: TableConfig, policy: PolicyRecord, name: str) -> Scenes:
     cell = parse_cell(name)
     return Scenes(
-        method=method,
-        training_seed=training_seed,
+        method=policy.method,
+        training_seed=policy.training_seed,
         simulator=config.simulator,
         scenario=cell.scenario,
         object_size=cell.object_size,
@@ -142,61 +136,64 @@ def _scenes(config: TableConfig, method: str, training_seed: int, name: str) -> 
     )
 
 
-def _play_here(parts: list[_Part], keep: Callable[[_Part, list[Episode]], object]) -> None:
-    for settings, group in itertools.groupby(parts, key=lambda part: part.config):
-        with one_thread(), closing(Player(settings)) as player:
-            for part in group:
-                episodes: list[Episode] = []
-                player.play(part.index, episodes.append)
-                keep(part, episodes)
-
-
-def _play_in_processes(parts: list[_Part], workers: int, keep: Callable[[_Part, list[Episode]], object]) -> None:
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent) as pool:
-        futures = {pool.submit(play_in_worker, part.config, part.index): part for part in parts}
-        try:
-            for future in as_completed(futures):
-                keep(futures[future], future.result())
-        except BrokenProcessPool:
-            msg = "a process that plays has died; what was played is kept, the same command goes on from there"
-            raise WorkerError(msg) from None
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)  # else leaving the block would play on to the end
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent is killed: it would wait for work forever."""
-    parent = multiprocessing.parent_process()
-
-    def wait() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
 def _write(config: TableConfig, store: OutcomeStore) -> str:
     """Return the table, made from the outcomes alone, and write its files."""
-    seeds = config.seeds or (SHIPPED,)
-    played = {
+    shown = set(itertools.product(config.methods, config.seeds or (SHIPPED,)))
+    policies = [entry for entry in store.policies() if (entry.method, entry.training_seed) in shown]
+    results = compare(_played(config, store, policies))
+    page = as_markdown(results, policies, _description(config), store.code())
+    if config.compare_with is not None:
+        page += f"\n{_agreement(config, store, policies, config.compare_with)}"
+    for name, text in (("table.md", page), ("table.csv", as_csv(results)), ("table.tex", as_latex(results))):
+        (config.out / name).write_text(text, encoding="utf-8")
+    for form in ("png", "svg"):
+        (config.out / f"table.{form}").write_bytes(table_figure(results, _description(config), form))
+    _write_parquet(config, store, results)
+    return page
+
+
+def _write_parquet(config: TableConfig, store: OutcomeStore, results: list[Result]) -> None:
+    columns = {name: [getattr(entry, name) for entry in results] for name in Result.__dataclass_fields__}
+    try:
+        write_parquet(columns, config.out / "table.parquet")
+        write_parquet(store.columns(), config.out / "outcomes.parquet")
+    except UnavailableError as error:
+        sys.stderr.write(f"{error}\n")
+
+
+def _played(config: TableConfig, store: OutcomeStore, policies: list[PolicyRecord]) -> Played:
+    """Return how all scenes were played, by method, cell and training seed."""
+    return {
         method: {
-            cell: [store.read(_scenes(config, method, seed, cell), config.episodes) for seed in seeds]
+            cell: [
+                store.read(_scenes(config, policy, cell), config.episodes)
+                for policy in policies
+                if policy.method == method
+            ]
             for cell in config.cells
         }
         for method in config.methods
     }
-    results = compare(played)
-    shown = set(itertools.product(config.methods, seeds))
-    policies = [entry for entry in store.policies() if (entry.method, entry.training_seed) in shown]
-    page = as_markdown(results, policies, _settings(config))
-    for name, text in (("table.md", page), ("table.csv", as_csv(results)), ("table.tex", as_latex(results))):
-        (config.out / name).write_text(text, encoding="utf-8")
-    return page
 
 
-def _settings(config: TableConfig) -> str:
+def _agreement(config: TableConfig, store: OutcomeStore, policies: list[PolicyRecord], path: Path) -> str:
+    """Return the section that compares with another file of outcomes."""
+    found: dict[tuple[str, str], Agreement] = {}
+    with closing(OutcomeStore(path, chunk=None)) as other:
+        for simulator in CHUNKS:
+            pairs: dict[str, list[tuple[Episode, Episode]]] = {}
+            for policy, cell in itertools.product(policies, config.cells):
+                own = _scenes(config, policy, cell)
+                theirs = other.read(dataclasses.replace(own, simulator=simulator), config.episodes)
+                pairs.setdefault(policy.method, []).extend(pair(theirs, store.read(own, config.episodes)))
+            for method, both in {**pairs, "all": [entry for group in pairs.values() for entry in group]}.items():
+                compared = agreement(both)
+                if compared is not None:
+                    found[method, simulator] = compared
+        return agreement_section(found, f"{path.as_posix()} (chunk {other.chunk}, here {store.chunk})")
+
+
+def _description(config: TableConfig) -> str:
     return (
         f"{config.episodes} scenes a cell, seed {config.seed}, at most {config.max_obstacles} obstacles, simulator"
         f" {config.simulator}"

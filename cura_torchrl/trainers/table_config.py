@@ -16,6 +16,9 @@ from cura_torchrl.trainers.paper_table import PAPER_CELLS
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+CHUNKS: dict[Simulator, int] = {"bullet": 20, "planar": 250}
+"""Episodes that are played side by side by default [1]: worlds made of tensors are cheaper in large batches."""
+
 _CELL_NAMES = f"all, or SCENARIO-SIZE with {', '.join(get_args(ScenarioKind))} and 0.3 to 1.2 m, such as uniform-0.5"
 
 
@@ -85,8 +88,11 @@ class TableConfig:
     """Folder for the outcomes and the table."""
     num_workers: int = 2
     """Processes that play [1]; results do not depend on it."""
-    chunk: int = 20
-    """Episodes that a process plays side by side [1]; the outcomes of one folder all have the same."""
+    chunk: int | None = None
+    """Episodes that a process plays side by side [1], 20 on PyBullet and 250 on planar if not given. Policies round
+    differently in batches of another size, so that the outcomes of one folder all have the same."""
+    compare_with: Path | None = None
+    """File of outcomes, of this or the other simulator: tells how many of the same scenes ended alike."""
 
     def __post_init__(self) -> None:
         require_finite(self)
@@ -100,11 +106,18 @@ class TableConfig:
             hint = f" (did you mean {close[0]}?)" if close else ""
             require(name in accepted, "method", name, ", ".join(accepted) + hint)
         require(0 <= self.max_obstacles <= 6, "max_obstacles", self.max_obstacles, "0 to 6")
-        for field in ("episodes", "num_workers", "chunk"):
-            require(getattr(self, field) > 0, field, getattr(self, field), "1 or more")
+        for field in ("episodes", "num_workers", "side_by_side"):
+            require(getattr(self, field) > 0, field.replace("side_by_side", "chunk"), getattr(self, field), "1 or more")
+        where = self.compare_with
+        require(where is None or where.is_file(), "compare_with", str(where), "a file of outcomes")
         require(0 <= self.seed < 2**31, "seed", self.seed, "0 to 2147483647")
         are_seeds = all(0 <= seed < 2**31 for seed in self.seeds) and len(set(self.seeds)) == len(self.seeds)
         require(are_seeds, "seeds", self.seeds, "different ones of 0 to 2147483647")
+
+    @property
+    def side_by_side(self) -> int:
+        """Episodes that a process plays side by side [1]."""
+        return CHUNKS[self.simulator] if self.chunk is None else self.chunk
 
 
 def _cells(names: Iterable[str]) -> list[Cell]:

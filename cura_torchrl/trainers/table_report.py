@@ -1,44 +1,22 @@
-"""The table of success rates: numbers from outcomes, and Markdown, CSV and LaTeX from the numbers."""
+"""The table of success rates as Markdown, CSV and LaTeX."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from cura_torchrl.trainers.evaluate import summarise
 from cura_torchrl.trainers.methods import PRESETS
 from cura_torchrl.trainers.outcomes import SHIPPED
-from cura_torchrl.trainers.paper_table import PAPER_CELLS, paper_success
-from cura_torchrl.trainers.statistics import (
-    bootstrap_rates,
-    interquartile_mean,
-    mcnemar,
-    paired_difference,
-    share_recovered,
-    wilson_interval,
-)
+from cura_torchrl.trainers.table_numbers import BASELINE, UNOCCLUDED, Result
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from cura_torchrl.trainers.agreement import Agreement
+    from cura_torchrl.trainers.outcomes import CodeRecord, PolicyRecord
 
-    from cura_torchrl.trainers.evaluate import Episode
-    from cura_torchrl.trainers.outcomes import PolicyRecord
-
-    Played = Mapping[str, Mapping[str, Sequence[Sequence[Episode]]]]
-
-BASELINE = "push"
-"""Whom the others are compared with."""
-UNOCCLUDED = "push-no-occlusion"
-"""Who plays without the loss by occlusion."""
-
-_NAN = (math.nan, math.nan, math.nan)
 _LATEX = str.maketrans({
     **{character: f"\\{character}" for character in "&%$#_{}"},
     "~": r"\textasciitilde{}",
@@ -47,151 +25,16 @@ _LATEX = str.maketrans({
 })  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
-class Result:
-    """One method in one cell, or in all of them. Rates are means over training seeds; what is not known is NaN."""
-
-    method: str
-    """Name of the method."""
-    cell: str
-    """Name of the cell, or "all"."""
-    seeds: int
-    """Training seeds [1]."""
-    scenes: int
-    """Scenes that each of them played [1]."""
-    success: float
-    """Goal reached within 0.5 m before any collision [1]."""
-    low: float
-    """Lower bound of the 95 % interval [1]: Wilson's of the success; with several seeds, the IQM's by bootstrap."""
-    high: float
-    """Upper bound of it [1]."""
-    iqm: float
-    """Interquartile mean of the success over training seeds, and cells [1]; NaN with one seed."""
-    paper: float
-    """Success that the paper prints [1]."""
-    success_025: float
-    """Success within 0.25 m [1]."""
-    success_010_10deg: float
-    """Success within 0.10 m and 10 degrees [1]."""
-    collisions: float
-    """Episodes that ended in a collision [1]."""
-    hit_base: float
-    """Those in which the base touched an obstacle [1]."""
-    hit_arm: float
-    """Those in which the arm did [1]."""
-    hit_object: float
-    """Those in which the object did [1]."""
-    timeouts: float
-    """Episodes that ended by time-out [1]."""
-    tipped: float
-    """Episodes in which the object tipped over [1]."""
-    difference: float
-    """Success less that of the baseline, on the same scenes [1]."""
-    difference_low: float
-    """Lower bound of its 95 % interval [1]: Newcombe's; with several seeds, by bootstrap."""
-    difference_high: float
-    """Upper bound of it [1]."""
-    mcnemar_p: float
-    """McNemar's exact p of the difference [1]; with several seeds NaN, for their pairs are not independent."""
-    share: float
-    """Share of the loss by occlusion that is recovered [1]."""
-    share_low: float
-    """Lower bound of its 95 % bootstrap interval [1]."""
-    share_high: float
-    """Upper bound of it [1]."""
-
-
-def compare(played: Played) -> list[Result]:
-    """Return the numbers of the table.
-
-    Args:
-        played: For each method and cell, for each training seed, how the scenes were played, in the same order.
-
-    Returns:
-        A result for each method and cell, and, with several cells, for each method over all.
-    """
-    cells = list(next(iter(played.values())))
-    groups = {cell: [cell] for cell in cells} | ({"all": cells} if len(cells) > 1 else {})
-    return [_result(played, method, name, group) for method in played for name, group in groups.items()]
-
-
-def _result(played: Played, method: str, name: str, group: list[str]) -> Result:
-    runs = [run for cell in group for run in played[method][cell]]
-    episodes = [episode for run in runs for episode in run]
-    counts = summarise(episodes)
-    is_printed = name != "all" or set(group) == set(PAPER_CELLS)
-    printed = paper_success(method, name) if is_printed else None
-    count, seeds = counts["episodes"], len(played[method][group[0]])
-    hits = {f"hit_{name}": number / count for name, number in counts["collisions_by"].items()}
-    iqm, low, high = _interval([_trials(played[method][cell]) for cell in group])
-    difference, p = _difference(played, method, group)
-    share = _share(played, method, group)
-    return Result(
-        method=method,
-        cell=name,
-        seeds=seeds,
-        scenes=count // seeds,
-        success=counts["success_rate"],
-        low=low,
-        high=high,
-        iqm=iqm,
-        paper=math.nan if printed is None else printed,
-        success_025=counts["success_rate_025"],
-        success_010_10deg=counts["success_rate_010_10deg"],
-        collisions=counts["collisions"] / count,
-        **hits,
-        timeouts=counts["timeouts"] / count,
-        tipped=counts["tipped"] / count,
-        **dict(zip(("difference", "difference_low", "difference_high"), difference, strict=True)),
-        mcnemar_p=p,
-        **dict(zip(("share", "share_low", "share_high"), share, strict=True)),
-    )
-
-
-def _trials(runs: Sequence[Sequence[Episode]]) -> NDArray[np.bool_]:
-    """Return the successes, shape ``[S, M]``: S training seeds, M scenes."""
-    return np.array([[episode.success[0] for episode in run] for run in runs], dtype=bool)
-
-
-def _interval(trials: list[NDArray[np.bool_]]) -> tuple[float, float, float]:
-    """Return the interquartile mean, NaN with one seed, and the interval of the success."""
-    if len(trials[0]) == 1:
-        joined = np.concatenate(trials, axis=1)
-        return math.nan, *wilson_interval(int(joined.sum()), joined.size)
-    (drawn,) = bootstrap_rates([[cell] for cell in trials])
-    low, high = np.quantile(interquartile_mean(drawn.reshape(len(drawn), -1)), (0.025, 0.975))
-    middle = interquartile_mean(np.concatenate([cell.mean(axis=1) for cell in trials]))
-    return float(middle), float(low), float(high)
-
-
-def _difference(played: Played, method: str, group: list[str]) -> tuple[tuple[float, float, float], float]:
-    """Return the difference from the baseline with its interval, and McNemar's p."""
-    if method == BASELINE or BASELINE not in played:
-        return _NAN, math.nan
-    pairs = [[_trials(played[who][cell]) for who in (BASELINE, method)] for cell in group]
-    if len(pairs[0][0]) == 1:
-        one, other = (np.concatenate([pair[k] for pair in pairs], axis=1) for k in range(2))
-        return paired_difference(one, other), mcnemar(one, other)
-    one, other = (rates.mean((1, 2)) for rates in bootstrap_rates(pairs))
-    low, high = np.quantile(other - one, (0.025, 0.975))
-    middle = np.mean([pair[1].mean() - pair[0].mean() for pair in pairs])
-    return (float(middle), float(low), float(high)), math.nan
-
-
-def _share(played: Played, method: str, group: list[str]) -> tuple[float, float, float]:
-    needed = (UNOCCLUDED, BASELINE)
-    if method in needed or not set(needed) <= set(played):
-        return _NAN
-    return share_recovered([[_trials(played[who][cell]) for who in (*needed, method)] for cell in group])
-
-
-def as_markdown(results: list[Result], policies: Iterable[PolicyRecord], settings: str) -> str:
+def as_markdown(
+    results: list[Result], policies: Iterable[PolicyRecord], settings: str, code: Iterable[CodeRecord] = ()
+) -> str:
     """Return the table with its notes in Markdown.
 
     Args:
         results: The numbers.
         policies: Who played.
         settings: Which scenes were played, in words.
+        code: What they were played by.
 
     Returns:
         The page.
@@ -205,6 +48,7 @@ def as_markdown(results: list[Result], policies: Iterable[PolicyRecord], setting
         _endings(results),
         *_differences(results),
         *_shares(results),
+        *_ways(results),
         "## Policies",
         _rows(
             ("Method", "Training seed", "Frames", "Commit", "SHA-256 of the weights"),
@@ -213,6 +57,7 @@ def as_markdown(results: list[Result], policies: Iterable[PolicyRecord], setting
                 for p in policies
             ],
         ),
+        *(f"Played at commit {entry.commit}, with {_versions(entry)}." for entry in code),
     ]
     return "\n\n".join(blocks) + "\n"
 
@@ -231,7 +76,7 @@ def _note(results: list[Result]) -> str:
 
 
 def _success_grid(results: list[Result]) -> str:
-    return _rows(("Method", *map(_cell_label, _cells(results))), _grid(results, " to ", "; paper "))
+    return _rows(("Method", *map(cell_label, _cells(results))), _grid(results, " to ", "; paper "))
 
 
 def _grid(results: list[Result], dash: str, paper: str) -> list[tuple[str, ...]]:
@@ -294,6 +139,74 @@ def _shares(results: list[Result]) -> list[str]:
     return section if rows else []
 
 
+def _ways(results: list[Result]) -> list[str]:
+    """Return the section on what was measured, nothing where nothing was."""
+    rows = [
+        (
+            *_names(r),
+            f"{r.steps:.0f}",
+            *(_plain(value, digits) for value, digits in ((r.clearance, 2), (r.goal_distance, 2))),
+            _plain(math.degrees(r.yaw_error), 1),
+            *(_plain(value, 1) for value in (r.base_path, r.object_path, 100 * r.unseen)),
+            _plain(r.delay, 2),
+        )
+        for r in results
+        if not math.isnan(r.goal_distance)
+    ]
+    section = [
+        "## Ways, clearance and sight",
+        "Until goal, collision or time-out: mean number of steps of the policy; least distance of robot and object from"
+        " an obstacle (median of the episodes that have one); mean lengths of the paths; obstacles that no ray hit, and"
+        " the mean time from an obstacle's appearance to the first ray that hits it. At the end of the episode, which"
+        " goes on after a success: median distance and angle between object and goal.",
+        _rows(
+            (
+                *("Method", "Cell", "steps", "clearance [m]", "to goal [m]", "angle [°]", "base's path [m]"),
+                *("object's path [m]", "never seen [%]", "seen after [s]"),
+            ),
+            rows,
+        ),
+    ]
+    return section if rows else []
+
+
+def agreement_section(found: Mapping[tuple[str, str], Agreement], title: str) -> str:
+    """Return how the outcomes compare with those of another file in Markdown.
+
+    Args:
+        found: The comparison by name of the method, or "all", and by name of the other simulator.
+        title: What they are compared with, in words.
+
+    Returns:
+        A section of the page.
+    """
+    rows = [
+        (
+            PRESETS[method].label if method in PRESETS else method,
+            simulator,
+            f"{entry.scenes:,}",
+            f"{100 * entry.alike:.1f} %",
+            f"{100 * entry.before:.1f}",
+            f"{100 * entry.success:.1f}",
+            _with_interval(entry.success - entry.before, entry.low, entry.high, "+.1f", 100.0),
+        )
+        for (method, simulator), entry in found.items()
+    ]
+    head = (
+        "Method",
+        "Simulator there",
+        "Scenes",
+        "Ended alike",
+        "Success there [%]",
+        "here [%]",
+        "Difference [points]",
+    )
+    told = "Success, collision or time-out on the same scenes; the difference with Newcombe's 95 % interval for pairs."
+    return (
+        "\n\n".join([f"## Agreement with {title}", told, _rows(head, rows) if rows else "No scene is in both."]) + "\n"
+    )
+
+
 def as_csv(results: list[Result]) -> str:
     """Return all numbers as comma-separated values.
 
@@ -323,7 +236,7 @@ def as_latex(results: list[Result]) -> str:
         The tabular; the paper's rates are in brackets.
     """
     cells = _cells(results)
-    head = ("Method", *map(_cell_label, cells))
+    head = ("Method", *map(cell_label, cells))
     lines = [" & ".join(latex(entry) for entry in row) + r" \\" for row in (head, *_grid(results, "--", ", paper "))]
     body = [r"\hline", lines[0], r"\hline", *lines[1:], r"\hline"]
     note = f"% {' '.join(_note(results).split())}"
@@ -346,12 +259,24 @@ def latex(text: str) -> str:
     return text.translate(_LATEX)
 
 
+def cell_label(cell: str) -> str:
+    """Return a cell's name for tables and figures.
+
+    Args:
+        cell: Its name, or "all".
+
+    Returns:
+        Words.
+
+    Examples:
+        >>> cell_label("uniform-0.5")
+        'uniform 0.5 m'
+    """
+    return f"{cell.replace('-', ' ')} m" if "-" in cell else cell
+
+
 def _cells(results: list[Result]) -> list[str]:
     return list(dict.fromkeys(result.cell for result in results))
-
-
-def _cell_label(cell: str) -> str:
-    return f"{cell.replace('-', ' ')} m" if "-" in cell else cell
 
 
 def _seed_name(seed: int) -> str:
@@ -359,7 +284,7 @@ def _seed_name(seed: int) -> str:
 
 
 def _names(result: Result) -> tuple[str, str]:
-    return PRESETS[result.method].label, _cell_label(result.cell)
+    return PRESETS[result.method].label, cell_label(result.cell)
 
 
 def _with_interval(middle: float, low: float, high: float, form: str, scale: float = 1.0) -> str:
@@ -367,6 +292,14 @@ def _with_interval(middle: float, low: float, high: float, form: str, scale: flo
         return "-"
     interval = "-" if math.isnan(low) else f"{scale * low:{form}} to {scale * high:{form}}"
     return f"{scale * middle:{form}} ({interval})"
+
+
+def _plain(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _versions(code: CodeRecord) -> str:
+    return ", ".join(f"{name} {version}" for name, version in code.versions.items() if version != "not installed")
 
 
 def _p(p: float) -> str:

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from cura_torchrl.trainers.episode_measures import Measures
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.evaluate import Episode
-from cura_torchrl.trainers.outcomes import SHIPPED, OutcomeStore, PolicyRecord, Scenes
+from cura_torchrl.trainers.outcomes import SHIPPED, CodeRecord, OutcomeStore, PolicyRecord, Scenes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,6 +28,7 @@ SCENES = Scenes(
     scene_seed=0,
 )
 POLICY = PolicyRecord(method="push", training_seed=SHIPPED, weights_sha256="a" * 64, frames=8, commit="c0ffee")
+CODE = CodeRecord(commit="beef", versions={"torch": "2.13.0"})
 
 
 def episode(index: int, *, success: bool = False, collision: bool = False) -> Episode:
@@ -38,6 +40,18 @@ def episode(index: int, *, success: bool = False, collision: bool = False) -> Ep
         contact=(False, collision, True),
         tipped=True,
         steps=17 + index,
+        measures=Measures(
+            min_clearance=None if success else 0.5,
+            goal_distance=0.25 + index,
+            yaw_error=0.1,
+            base_path=13.5,
+            object_path=12.5,
+            obstacles=4,
+            obstacles_unseen=1,
+            first_sighting=None if collision else 3.4,
+            mean_delay=0.7,
+            longest_delay=2.2,
+        ),
     )
 
 
@@ -46,7 +60,7 @@ def test_what_is_read_is_what_was_written(tmp_path: Path) -> None:
     played = [episode(2, collision=True), episode(0, success=True), episode(1)]
     with closing(OutcomeStore(tmp_path / "new" / "outcomes.sqlite", chunk=20)) as store:
         store.register(POLICY)
-        store.add(SCENES, played)
+        store.add(SCENES, played, CODE)
         for field, other in (
             ("scenario", "adversarial"),
             ("training_seed", 3),
@@ -58,6 +72,11 @@ def test_what_is_read_is_what_was_written(tmp_path: Path) -> None:
         assert store.read(SCENES, 9) == sorted(played, key=lambda entry: entry.index)
         assert [entry.index for entry in store.read(SCENES, 2)] == [0, 1]
         assert store.policies() == [POLICY]
+        assert store.code() == [CODE]
+        columns = store.columns()
+        assert columns["commit"] == ["beef"] * 3
+        assert columns["goal_distance"] == [0.25, 1.25, 2.25]
+        assert columns["min_clearance"] == [None, 0.5, 0.5]
 
 
 def test_a_part_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -70,7 +89,7 @@ def test_a_part_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
 
     with closing(OutcomeStore(tmp_path / "outcomes.sqlite", chunk=20)) as store:
         with pytest.raises(KeyboardInterrupt):
-            store.add(SCENES, broken_off())
+            store.add(SCENES, broken_off(), CODE)
         assert store.read(SCENES, 9) == []
 
 
@@ -99,7 +118,7 @@ def test_a_damaged_file_is_refused_in_one_line(damage: object, message: str, tmp
     """Catches a traceback, and a table that is made from what is left of the outcomes."""
     path = tmp_path / "outcomes.sqlite"
     with closing(OutcomeStore(path, chunk=20)) as store:
-        store.add(SCENES, [episode(index) for index in range(500)])
+        store.add(SCENES, [episode(index) for index in range(500)], CODE)
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(RunError, match=message) as told:
         OutcomeStore(path, chunk=20)
@@ -114,9 +133,36 @@ def test_a_file_of_another_version_chunk_or_program_is_refused(tmp_path: Path) -
         OutcomeStore(path, chunk=5)
     with closing(sqlite3.connect(path)) as database:
         database.execute("PRAGMA user_version = 99")
-    with pytest.raises(RunError, match="is of version 99; accepted: version 1"):
+    with pytest.raises(RunError, match="is of version 99; accepted: version 2"):
         OutcomeStore(path, chunk=20)
     with closing(sqlite3.connect(foreign)) as database:
         database.execute("CREATE TABLE mail (sender TEXT)")
     with pytest.raises(RunError, match="is no file of outcomes"):
         OutcomeStore(foreign, chunk=20)
+
+
+def test_rows_tell_by_which_code_they_were_played(tmp_path: Path) -> None:
+    """Catches rows that pass for those of the last commit, and code that is listed though none of its rows is left."""
+    later = CodeRecord(commit="cafe", versions={"torch": "2.14.0"})
+    with closing(OutcomeStore(tmp_path / "outcomes.sqlite", chunk=20)) as store:
+        store.add(SCENES, [episode(0), episode(1)], CODE)
+        store.add(SCENES, [episode(1), episode(2)], later)
+        assert store.code() == [CODE, later]
+        assert store.columns()["commit"] == ["beef", "cafe", "cafe"]
+        store.add(SCENES, [episode(0)], later)
+        assert store.code() == [later]
+
+
+def test_a_file_can_be_read_whatever_it_was_filled_with_but_is_not_made(tmp_path: Path) -> None:
+    """Catches a comparison that changes the other file, or that makes an empty one where a name is misspelt."""
+    path = tmp_path / "outcomes.sqlite"
+    with closing(OutcomeStore(path, chunk=7)) as store:
+        store.add(SCENES, [episode(0)], CODE)
+    with closing(OutcomeStore(path, chunk=None)) as store:
+        assert store.chunk == 7
+        assert store.read(SCENES, 9) == [episode(0)]
+        with pytest.raises(RunError, match="cannot be used: attempt to write a readonly database"):
+            store.add(SCENES, [episode(1)], CODE)
+    with pytest.raises(RunError, match="cannot be used: unable to open database file"):
+        OutcomeStore(tmp_path / "other.sqlite", chunk=None)
+    assert not (tmp_path / "other.sqlite").exists()

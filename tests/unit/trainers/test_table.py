@@ -6,29 +6,42 @@ import csv
 import dataclasses
 import io
 import math
+import signal
 import sqlite3
+import subprocess
+import sys
+import time
 from contextlib import closing
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 import torch
 
 from cura_torchrl.trainers.build import Networks
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
-from cura_torchrl.trainers.errors import CheckpointError, RunError
-from cura_torchrl.trainers.evaluate import Episode, Player
+from cura_torchrl.trainers.episode_measures import Measures
+from cura_torchrl.trainers.errors import CheckpointError, RunError, UnavailableError
+from cura_torchrl.trainers.evaluate import Episode, Part, Player
+from cura_torchrl.trainers.methods import METHODS as METHOD_LABELS
 from cura_torchrl.trainers.outcomes import PolicyRecord
 from cura_torchrl.trainers.paper_table import PAPER_CELLS, PAPER_SUCCESS, paper_success
 from cura_torchrl.trainers.table import STORE_NAME, table
 from cura_torchrl.trainers.table_config import TableConfig
-from cura_torchrl.trainers.table_report import as_csv, as_latex, as_markdown, compare, latex
+from cura_torchrl.trainers.table_figure import table_figure
+from cura_torchrl.trainers.table_numbers import compare
+from cura_torchrl.trainers.table_parquet import write_parquet
+from cura_torchrl.trainers.table_report import as_csv, as_latex, as_markdown, latex
 from tests.runs import small_run
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 METHODS = ("push-no-occlusion", "push", "cura-ppo")
+METHODS_2 = ("push-conf", "cura-no-risk")
 CELLS = ("uniform-0.5", "adversarial-1.0")
+
+
+@pytest.fixture(autouse=True)
+def one_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The checkout's commit, which someone may change meanwhile."""
+    monkeypatch.setattr("cura_torchrl.trainers.table.git_commit", lambda: "c0ffee")
 
 
 def run_of(letters: str) -> list[Episode]:
@@ -81,6 +94,14 @@ def rows_of(path: Path) -> list[tuple[object, ...]]:
         return database.execute("SELECT * FROM outcomes").fetchall()
 
 
+def played_rows(path: Path) -> bool:
+    """Whether a file that may still be made holds outcomes."""
+    try:
+        return bool(rows_of(path))
+    except sqlite3.OperationalError:
+        return False
+
+
 def test_a_run_that_was_broken_off_ends_with_the_same_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches scenes that are lost, counted twice or played differently after the command was killed."""
     untrained(tmp_path, "push", 0)
@@ -88,11 +109,12 @@ def test_a_run_that_was_broken_off_ends_with_the_same_table(tmp_path: Path, monk
     whole = table(tiny(tmp_path, "whole"))
     play, parts = Player.play, []
 
-    def dies_in_the_third_part(self: Player, part: int, report: object) -> None:
-        parts.append(part)
-        play(self, part, report)
+    def dies_in_the_third_part(self: Player, part: Part, report: object) -> list[Episode]:
+        parts.append(part.index)
+        played = play(self, part, report)
         if len(parts) == 3:
             raise KeyboardInterrupt
+        return played
 
     monkeypatch.setattr(Player, "play", dies_in_the_third_part)
     with pytest.raises(KeyboardInterrupt):
@@ -105,6 +127,50 @@ def test_a_run_that_was_broken_off_ends_with_the_same_table(tmp_path: Path, monk
     assert rows_of(tmp_path / "broken" / STORE_NAME) == rows_of(tmp_path / "whole" / STORE_NAME)
     for name in ("table.md", "table.csv", "table.tex"):
         assert (tmp_path / "broken" / name).read_text() == (tmp_path / "whole" / name).read_text()
+
+
+def test_a_run_that_was_killed_goes_on_and_ends_with_the_same_file(tmp_path: Path) -> None:
+    """Catches a file that SIGKILL leaves half written, and processes that play on without a parent."""
+    untrained(tmp_path, "push", 0)
+    flags = ["--methods", "push", "--cells", ",".join(CELLS), "--seeds", "0", "--runs", str(tmp_path)]
+    options = [*flags, "--episodes", "24", "--chunk", "2", "--simulator", "planar", "--num-workers", "2"]
+    command = [sys.executable, "-m", "cura_torchrl.trainers.cli", "table", *options, "--out"]
+    killed, whole = tmp_path / "killed" / STORE_NAME, tmp_path / "whole" / STORE_NAME
+    with subprocess.Popen(
+        [*command, str(killed.parent)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as process:
+        deadline = time.monotonic() + 200
+        while time.monotonic() < deadline and not (killed.exists() and played_rows(killed)):
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+        # The pipe closes when the last of those that hold it has ended: the workers too.
+        process.communicate(timeout=60)
+    assert 0 < len(rows_of(killed)) < 48
+    assert len(rows_of(killed)) % 2 == 0
+    pages = [
+        subprocess.run([*command, str(path.parent)], capture_output=True, text=True, check=True).stdout
+        for path in (killed, whole)
+    ]
+    assert pages[0] == pages[1]
+    assert rows_of(killed) == rows_of(whole)
+    for name in ("table.md", "table.csv", "table.tex", "table.png", "table.svg"):
+        assert (killed.parent / name).read_bytes() == (whole.parent / name).read_bytes()
+
+
+def test_another_file_of_outcomes_is_compared_scene_by_scene(tmp_path: Path) -> None:
+    """Catches a comparison with other scenes, or one that plays before it finds that the file is none."""
+    untrained(tmp_path, "push", 0)
+    options = {"methods": ("push",), "episodes": 3}
+    table(tiny(tmp_path, "first", **options))
+    other = tmp_path / "first" / STORE_NAME
+    page = table(tiny(tmp_path, "second", compare_with=other, **options))
+    assert f"## Agreement with {other.as_posix()} (chunk 1, here 1)" in page
+    assert "| all | planar | 3 | 100.0 % |" in page
+    assert "No scene is in both" in table(tiny(tmp_path, "third", compare_with=other, seed=1, **options))
+    (tmp_path / "text").write_text("no database " * 400)
+    with pytest.raises(RunError, match="text is damaged"):
+        table(tiny(tmp_path, "fourth", compare_with=tmp_path / "text", **options))
+    assert not (tmp_path / "fourth").exists()
 
 
 def test_a_part_that_was_played_for_fewer_scenes_is_completed(tmp_path: Path) -> None:
@@ -191,6 +257,52 @@ def test_all_forms_show_the_same_numbers_and_say_what_the_interval_is() -> None:
     assert as_latex(results).count(r"\\") == 1 + len(METHODS)
 
 
+def test_measures_are_means_and_medians_over_what_there_was() -> None:
+    """Catches means over episodes without an obstacle, and delays that are not weighed by how many were seen.
+
+    Seen are 2 obstacles after 1.0 s on average and 1 after 4.0 s: 2.0 s; 2 of 5 are never seen.
+    """
+    values = {"goal_distance": 0.5, "yaw_error": 0.1, "object_path": 12.0, "first_sighting": 3.0, "longest_delay": 4.0}
+    measured = [
+        Measures(min_clearance=0.2, base_path=10.0, obstacles=2, obstacles_unseen=0, mean_delay=1.0, **values),
+        Measures(min_clearance=0.6, base_path=14.0, obstacles=3, obstacles_unseen=2, mean_delay=4.0, **values),
+        Measures(min_clearance=None, base_path=15.0, obstacles=0, obstacles_unseen=0, mean_delay=None, **values),
+    ]
+    run = [dataclasses.replace(one, measures=own) for one, own in zip(run_of("sss"), measured, strict=True)]
+    (result,) = compare({"push": {"uniform-0.5": [run]}})
+    assert (result.clearance, result.base_path, result.unseen, result.delay) == pytest.approx((0.4, 13.0, 0.4, 2.0))
+    assert "| Push w/ Occlusion | uniform 0.5 m | 9 | 0.40 | 0.50 | 5.7 | 13.0 | 12.0 | 40.0 | 2.00 |" in as_markdown(
+        [result], [], "3 scenes"
+    )
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_the_picture_names_all_methods_and_cells_and_is_the_same_each_time(count: int) -> None:
+    """Catches a method that is left out of the legend, and a date or a random name in the file."""
+    results = compare({method: {cell: [run_of("sssc")] for cell in CELLS} for method in [*METHODS, *METHODS_2][:count]})
+    text = table_figure(results, "4 scenes a cell", "svg").decode()
+    for label in {METHOD_LABELS[result.method].label for result in results} | {"the paper"}:
+        assert f"<!-- {label} -->" in text
+    assert text.count("<!-- adversarial 1.0 m -->") == 1
+    assert table_figure(results, "4 scenes a cell", "svg").decode() == text
+    assert table_figure(results, "4 scenes a cell", "png").startswith(b"\x89PNG")
+
+
+def test_parquet_holds_numbers_and_nulls(tmp_path: Path) -> None:
+    """Catches a NaN or a text in place of a missing number, and a column that is lost."""
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is optional")
+    write_parquet({"method": ["push", "push"], "share": [math.nan, 0.5], "scenes": [4, 8]}, tmp_path / "table.parquet")
+    read = parquet.read_table(tmp_path / "table.parquet").to_pydict()
+    assert read == {"method": ["push", "push"], "share": [None, 0.5], "scenes": [4, 8]}
+
+
+def test_without_pyarrow_a_line_tells_where_it_comes_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a traceback after hours of playing."""
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(UnavailableError, match=r"table.parquet is not written, .* pip install cura-torchrl\[table\]"):
+        write_parquet({}, tmp_path / "table.parquet")
+
+
 def test_latex_takes_no_name_for_a_command() -> None:
     """Catches a name that breaks the typesetting, or whose backslash is escaped twice."""
     assert latex("a_b & 5 % #1 ${x}") == r"a\_b \& 5 \% \#1 \$\{x\}"
@@ -219,6 +331,8 @@ def test_the_papers_numbers_are_in_the_order_of_its_cells() -> None:
         ({"methods": ("push", "cura")}, r"method is 'cura'; accepted: .*\(did you mean cura-ppo\?\)"),
         ({"methods": ("push-base",)}, "method is 'push-base'; accepted: cura-no-risk, "),
         ({"methods": (",",)}, "methods is "),
+        ({"chunk": 0}, "chunk is 0; accepted: 1 or more"),
+        ({"compare_with": Path("nowhere.sqlite")}, "compare_with is 'nowhere.sqlite'; accepted: a file of outcomes"),
         ({"episodes": 0}, "episodes is 0; accepted: 1 or more"),
         ({"seeds": (1, 1)}, "seeds is "),
     ],
