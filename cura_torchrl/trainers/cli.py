@@ -26,6 +26,7 @@ from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.info import capabilities, git_commit, hardware, shipped_methods, versions
 from cura_torchrl.trainers.methods import METHODS, method
+from cura_torchrl.trainers.report_config import ReportConfig
 from cura_torchrl.trainers.table_config import TableConfig
 
 if TYPE_CHECKING:
@@ -211,6 +212,15 @@ def _table(arguments: list[str]) -> None:
     sys.stdout.write(page)
 
 
+def _report(arguments: list[str]) -> None:
+    """Write a page about a trained policy, to look at and to send around."""
+    config = _parse(ReportConfig, "report", arguments)
+    module = _import("cura_torchrl.trainers.report")
+    with _clean_stdout():
+        page = module.report(config)
+    sys.stdout.write(f"{page}\n")
+
+
 def _defaults(arguments: list[str]) -> TrainConfig:
     """Return what the flags of ``train`` start from: the method's preset, or the run's own configuration."""
     scout = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -302,6 +312,7 @@ _COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "train": _train,
     "evaluate": _evaluate,
     "table": _table,
+    "report": _report,
     "release": _release,
     "demo": _demo,
     "bench": _bench,

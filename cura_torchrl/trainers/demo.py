@@ -253,20 +253,20 @@ def _draw(config: DemoConfig, pairs: Sequence[_Pair], workers: Executor) -> list
     return cards
 
 
-def draw_card(pair: _Pair, *, every: int) -> Card:
+def draw_card(recordings: tuple[Recording, ...], *, every: int) -> Card:
     """Draw a scene.
 
     Args:
-        pair: The scene as both policies played it.
+        recordings: The scene as each policy played it.
         every: Every how many recorded frames are shown [1].
 
     Returns:
         The scene with its pictures.
     """
-    frames = render.animation_frames(pair, every=every)
+    frames = render.animation_frames(recordings, every=every)
     return Card(
-        recordings=pair,
-        paths=figures.paths_figure(pair),
+        recordings=recordings,
+        paths=figures.paths_figure(recordings),
         animation=render.encode_animation(frames, frame_time=every * _FRAME_TIME),
     )
 

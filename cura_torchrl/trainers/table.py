@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import multiprocessing
 import os
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from cura_torchrl.trainers.checkpoint import SUMS_NAME, load_policy
+from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.config import EvaluateConfig
 from cura_torchrl.trainers.errors import CheckpointError, WorkerError
 from cura_torchrl.trainers.evaluate import Episode, Player, part_size, play_in_worker
@@ -85,9 +84,13 @@ def _policies(config: TableConfig) -> list[_Policy]:
         if loaded.config.method != method:
             msg = f"checkpoint {loaded.path} is of method {loaded.config.method}; accepted: a run of {method}"
             raise CheckpointError(msg)
-        sha256 = hashlib.sha256((loaded.path / SUMS_NAME).read_bytes()).hexdigest()
-        frames, commit = loaded.record["frames"], loaded.record["commit"]
-        record = PolicyRecord(method=method, training_seed=seed, weights_sha256=sha256, frames=frames, commit=commit)
+        record = PolicyRecord(
+            method=method,
+            training_seed=seed,
+            weights_sha256=loaded.weights_sha256,
+            frames=loaded.record["frames"],
+            commit=loaded.record["commit"],
+        )
         found.append(_Policy(record=record, path=loaded.path))
     return found
 
