@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import functools
 import inspect
 import itertools
 import textwrap
@@ -15,7 +14,6 @@ from cura_torchrl.trainers import markup
 from cura_torchrl.trainers.decoding import encode
 
 
-@functools.cache
 def field_docstrings(cls: type[Any]) -> dict[str, str]:
     """Return the docstrings of a dataclass's own fields, which Python itself does not keep.
 
@@ -37,9 +35,9 @@ def field_docstrings(cls: type[Any]) -> dict[str, str]:
     body = tree.body[0].body if isinstance(tree.body[0], ast.ClassDef) else []
     found = {}
     for node, after in itertools.pairwise(body):
-        is_field = isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
-        if is_field and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
-            found[node.target.id] = " ".join(str(after.value.value).split()).replace("``", "")
+        name = node.target.id if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) else None
+        if name is not None and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+            found[name] = " ".join(str(after.value.value).split()).replace("``", "")
     return found
 
 

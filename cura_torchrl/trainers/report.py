@@ -6,27 +6,26 @@ import dataclasses
 import sys
 from contextlib import closing
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from cura_torchrl.trainers import figures, report_page
 from cura_torchrl.trainers.build import load_encoder
-from cura_torchrl.trainers.checkpoint import load_policy, progress_path
+from cura_torchrl.trainers.checkpoint import LoadedPolicy, load_policy, progress_path
 from cura_torchrl.trainers.demo import draw_card
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.folder_section import read_folder
 from cura_torchrl.trainers.markup import document
-from cura_torchrl.trainers.methods import METHODS
 from cura_torchrl.trainers.progress import read_progress
 from cura_torchrl.trainers.recording import find_scene, record
 from cura_torchrl.trainers.report_config import ReportConfig
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from cura_torchrl.envs.config import TaskConfig
-    from cura_torchrl.trainers.checkpoint import LoadedPolicy
     from cura_torchrl.trainers.recording import Recording, Scene
 
 __all__ = ["ReportConfig", "report"]
@@ -64,7 +63,7 @@ def report(config: ReportConfig) -> Path:
 
     Raises:
         RunError: If what is to be read is missing or damaged; nothing is played then.
-    """  # noqa: DOC502 - raised by what this calls
+    """
     runs = _load_runs(config)
     curves = {run.label: run.rows for run in runs if run.rows} | _more_curves(config.curves)
     table = None if config.table is None else read_folder(config.table, TABLE_NAME, "table")
@@ -162,8 +161,8 @@ def _play(config: ReportConfig, players: list[Run]) -> tuple[Recording, ...]:
 
 def _play_one(config: ReportConfig, player: Run, task: TaskConfig, scene: Scene, bar: tqdm) -> Recording:
     loaded = player.loaded
-    options = {"task": task, "simulator": config.simulator, "keep_map": True, "seed": config.seed}
-    with closing(loaded.make_env(1, **options)) as env:
+    env = loaded.make_env(1, task=task, simulator=config.simulator, keep_map=True, seed=config.seed)
+    with closing(env):
         (recording,) = record(
             env,
             loaded.policy,

@@ -93,8 +93,8 @@ def run_section(source: str, loaded: LoadedPolicy, rows: Rows, others: Sequence[
         "Method": f"{method_label(loaded)} ({config.method})",
         "What it is": f"LiDAR {sees}; confidence map with decay {config.map.decay:g} a step; weights of the costs in "
         f"the advantage: risk {config.cura.risk_coeff:g}, uncertainty {config.cura.uncertainty_coeff:g}",
-        "Trained for": f"{record['frames']:,} environment steps on {config.simulator}, {config.num_envs} worlds side by "
-        f"side, seed {record['seed']}",
+        "Trained for": f"{record['frames']:,} environment steps on {config.simulator}, {config.num_envs} worlds side "
+        f"by side, seed {record['seed']}",
         "Time of training": _training_time(rows),
         "Commit": str(record["commit"]),
         "Versions": ", ".join(f"{name} {version}" for name, version in record["versions"].items()),
@@ -218,8 +218,8 @@ def scene_section(card: Card, snapshots: bytes, distribution: bytes, config: Rep
 
 
 _MOMENTS = (
-    "a: the first obstacle appears; b: the highest uncertainty between a and c; c: the end. Maps are in the base frame; "
-    "dark is unseen in the map of confidence and occupied in that of occupancy."
+    "a: the first obstacle appears; b: the highest uncertainty between a and c; c: the end. Maps are in the base "
+    "frame; dark is unseen in the map of confidence and occupied in that of occupancy."
 )
 
 
