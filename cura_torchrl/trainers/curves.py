@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
     Rows = Sequence[Mapping[str, float]]
 
-WINDOW = 15
-"""Updates that a point is the mean of [1]."""
-
 _COLUMNS = 3
 _STYLES = (
     (raster.UNCERTAINTY, "-"),
@@ -79,13 +76,15 @@ GROUPS = (
             "std",
             "kl",
             "clip_fraction",
+            "ESS",
             "lr",
+            "loss_entropy",
             "actor_grad_norm",
             "critic_grad_norm",
             "collision_grad_norm",
         ),
     ),
-    Group("Speed", ("frames_per_second", "collect_seconds", "update_seconds")),
+    Group("Speed", ("frames_per_second", "collect_seconds", "update_seconds", "episodes")),
 )
 """The plots; a column that no group names is drawn in a last group, so that none is left out."""
 
@@ -104,14 +103,17 @@ _LABELS = {
     "risk_uncertainty_correlation": "correlation of R and U [1]",
     "risk_cost_std": "std. deviation of the risk cost [1]",
     "uncertainty_cost_std": "std. deviation of the uncertainty cost [1]",
-    "risk_weight": "weight of the risk cost in the advantage [1]",
-    "uncertainty_weight": "weight of the uncertainty cost in the adv. [1]",
+    "risk_weight": "weight of the risk cost [1]",
+    "uncertainty_weight": "weight of the uncertainty cost [1]",
     "loss_objective": "loss of the actor [1]",
     "loss_critic": "loss of the critic [1]",
     "loss_collision": "loss of the estimator [1]",
     "explained_variance": "variance that the critic explains [1]",
     "entropy": "entropy of the policy [nat]",
     "std": "std. deviation of the actions [1]",
+    "ESS": "effective sample size, share of the frames [1]",
+    "loss_entropy": "loss of the entropy bonus [1]",
+    "episodes": "episodes that rates are taken over [1]",
     "kl": "KL divergence of an update [nat]",
     "clip_fraction": "share of clipped ratios [1]",
     "lr": "learning rate of the actor [1]",
@@ -174,30 +176,46 @@ def _fits(name: str, wanted: str) -> bool:
     return name.startswith(wanted[:-1]) if wanted.endswith("*") else name == wanted
 
 
-def smooth(rows: Rows, column: str, window: int = WINDOW) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return environment steps and moving means over the last updates.
+def smooth(rows: Rows, column: str, window: int = 1) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return environment steps and means over the updates around each.
 
     Args:
         rows: Rows of a run's progress.
         column: Name in progress.csv.
-        window: Updates that a point is the mean of [1]; the first ones have fewer.
+        window: Updates that a point is the mean of, odd [1]; near both ends as many as there are on either side.
 
     Returns:
         Environment steps [million] and means of the column, of those rows that have a finite number in it.
 
     Examples:
-        >>> rows = [{"frames": 1e6 * (i + 1), "kl": float(i)} for i in range(4)]
-        >>> [values.tolist() for values in smooth(rows, "kl", 2)]
-        [[1.0, 2.0, 3.0, 4.0], [0.0, 0.5, 1.5, 2.5]]
+        >>> rows = [{"frames": 1e6 * (i + 1), "kl": float(i * i)} for i in range(4)]
+        >>> [values.round(2).tolist() for values in smooth(rows, "kl", 3)]
+        [[1.0, 2.0, 3.0, 4.0], [0.0, 1.67, 4.67, 9.0]]
     """
     points = [(row["frames"] / 1e6, row[column]) for row in rows if math.isfinite(row.get(column, math.nan))]
     if not points:
         return np.empty(0), np.empty(0)
     frames, values = np.array(points, dtype=np.float64).T
     sums = np.concatenate([[0.0], np.cumsum(values)])
-    ends = np.arange(1, len(values) + 1)
-    starts = np.maximum(0, ends - window)
-    return frames, (sums[ends] - sums[starts]) / (ends - starts)
+    here = np.arange(len(values))
+    half = np.minimum(window // 2, np.minimum(here, here[::-1]))
+    return frames, (sums[here + half + 1] - sums[here - half]) / (2 * half + 1)
+
+
+def window_of(rows: Rows) -> int:
+    """Return how many updates a smooth line's point is the mean of.
+
+    Args:
+        rows: Rows of a run's progress.
+
+    Returns:
+        About a thirtieth of the updates, odd [1].
+
+    Examples:
+        >>> window_of([{}] * 204), window_of([{}] * 3)
+        (7, 1)
+    """
+    return 1 + 2 * round(len(rows) / 60)
 
 
 def curves_figure(runs: Mapping[str, Rows], columns: Sequence[str]) -> bytes:
@@ -230,13 +248,13 @@ def _draw(axis: Any, runs: Mapping[str, Rows], column: str) -> None:
     """Draw each run's means, and, faintly, what they are means of."""
     seen = []
     for (name, rows), (colour, style) in zip(runs.items(), cycle(_STYLES), strict=False):
-        frames, values = smooth(rows, column, 1)
+        frames, values = smooth(rows, column)
         seen.append(values)
         if column in _AS_THEY_ARE:
-            axis.step(frames, values, where="post", color=colour, linestyle=style, linewidth=1.6, label=name)
+            axis.step(frames, values, where="post", color=colour, linestyle=style, linewidth=1.1, label=name)
             continue
         axis.plot(frames, values, color=colour, linewidth=0.7, alpha=0.22)
-        axis.plot(*smooth(rows, column), color=colour, linestyle=style, linewidth=1.6, label=name)
+        axis.plot(*smooth(rows, column, window_of(rows)), color=colour, linestyle=style, linewidth=1.6, label=name)
     tidy(axis)
     axis.set_title(label_of(column), fontsize=9, loc="left")
     _set_range(axis, column, np.concatenate(seen))
@@ -246,6 +264,8 @@ def _set_range(axis: Any, column: str, values: NDArray[np.float64]) -> None:
     axis.tick_params(labelsize=8)
     if column in _RATES or column.startswith("success_"):
         axis.set_ylim(-0.02, 1.02)
+    elif column == "max_obstacles":
+        axis.set_ylim(-0.2, 6.4)
     elif column == "lr":
         axis.set_yscale("log")
     elif len(values) > _FEW:

@@ -253,12 +253,13 @@ def _draw(config: DemoConfig, pairs: Sequence[_Pair], workers: Executor) -> list
     return cards
 
 
-def draw_card(recordings: tuple[Recording, ...], *, every: int) -> Card:
+def draw_card(recordings: tuple[Recording, ...], *, every: int, frame_time: float = _FRAME_TIME) -> Card:
     """Draw a scene.
 
     Args:
         recordings: The scene as each policy played it.
         every: Every how many recorded frames are shown [1].
+        frame_time: Time for which each recorded frame would be shown [s].
 
     Returns:
         The scene with its pictures.
@@ -267,7 +268,7 @@ def draw_card(recordings: tuple[Recording, ...], *, every: int) -> Card:
     return Card(
         recordings=recordings,
         paths=figures.paths_figure(recordings),
-        animation=render.encode_animation(frames, frame_time=every * _FRAME_TIME),
+        animation=render.encode_animation(frames, frame_time=every * frame_time),
     )
 
 

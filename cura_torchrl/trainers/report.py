@@ -34,8 +34,8 @@ TABLE_NAME = "table.md"
 """File of a table's folder that is read."""
 CALIBRATION_NAME = "calibration.md"
 """File of a calibration's folder that is read."""
-_FRAME_TIME = 0.1
-"""Time for which a frame of the animation is shown [s]."""
+_SPEED_UP = 6.0
+"""How much faster than the robot the animation is [1]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +74,7 @@ def report(config: ReportConfig) -> Path:
         raise RunError(msg)
     first = runs[0]
     recordings = _play(config, _players(config, runs))
-    card = draw_card(recordings, every=1)
+    card = draw_card(recordings, every=1, frame_time=config.frame_stride * recordings[0].period / _SPEED_UP)
     others = [run.loaded for run in runs[1:]]
     sections = [
         report_page.run_section(first.source, first.loaded, first.rows, others),

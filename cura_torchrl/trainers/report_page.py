@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from cura_torchrl.trainers import markup
 from cura_torchrl.trainers.config import TrainConfig
 from cura_torchrl.trainers.configuration_tree import configuration_tree, count_differences
-from cura_torchrl.trainers.curves import WINDOW, columns_by_group, curves_figure, label_of, smooth
+from cura_torchrl.trainers.curves import columns_by_group, curves_figure, label_of, smooth
 from cura_torchrl.trainers.folder_section import Folder, folder_html
 from cura_torchrl.trainers.info import provenance
 from cura_torchrl.trainers.methods import METHODS, method
@@ -29,7 +29,18 @@ _INTRODUCTION = (
     "the policy a network is trained, the distributional collision estimator (DCE), which predicts the distribution of "
     "the collision possibility C: its mean is the risk R, its variance the uncertainty U."
 )
+_LAST = 15
+"""Updates that the table's means are over [1]."""
 _SUMMARY = ("success", "success_*", "collision", "timeout", "risk_auroc", "reward")
+
+
+_HOW_TO_READ_CURVES = (
+    "<p>Strong lines are means over a thirtieth of a run's updates around each point, faint ones each update's own "
+    "value. Success, collisions and time-outs are shares of the last episodes that ended while the policy explored, "
+    "with the number of obstacles K that the curriculum had reached: they are not the rates of the evaluation. Where a "
+    "run was resumed its worlds begin anew, and at first only short episodes have ended. Where a few updates are far "
+    "off, they lie outside of the plot.</p>"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +105,7 @@ def run_section(source: str, loaded: LoadedPolicy, rows: Rows, others: Sequence[
         "What it is": f"LiDAR {sees}; confidence map with decay {config.map.decay:g} a step; weights of the costs in "
         f"the advantage: risk {config.cura.risk_coeff:g}, uncertainty {config.cura.uncertainty_coeff:g}",
         "Trained for": f"{record['frames']:,} environment steps on {config.simulator}, {config.num_envs} worlds side "
-        f"by side, seed {record['seed']}",
+        f"by side on {config.device}, seed {record['seed']}",
         "Time of training": _training_time(rows),
         "Commit": str(record["commit"]),
         "Versions": ", ".join(f"{name} {version}" for name, version in record["versions"].items()),
@@ -130,10 +141,7 @@ def curves_section(runs: Mapping[str, Rows], *, has_own: bool) -> Section:
         )
     if runs:
         parts += [
-            f"<p>Strong lines are means over the last {WINDOW} updates, faint ones each update's own value. Success, "
-            "collisions and time-outs are shares of the last episodes that ended while the policy explored, with the "
-            "number of obstacles K that the curriculum had reached: they are not the rates of the evaluation. Where a "
-            "few updates are far off, they lie outside of the plot.</p>",
+            _HOW_TO_READ_CURVES,
             _last_means(runs),
         ]
     for title, columns in columns_by_group(runs).items():
@@ -154,10 +162,10 @@ def _last_means(runs: Mapping[str, Rows]) -> str:
     ]
     lines = []
     for name, rows in runs.items():
-        ends = [smooth(rows, column)[1][-1:] for column in columns]
-        values = (f"{end[0]:.3f}" if len(end) else "" for end in ends)
+        ends = [smooth(rows, column)[1][-_LAST:] for column in columns]
+        values = (f"{end.mean():.3f}" if len(end) else "" for end in ends)
         lines.append([name, f"{rows[-1]['frames']:,.0f}", *values])
-    caption = f"Means over the last {WINDOW} updates."
+    caption = f"Means over the last {_LAST} updates."
     return markup.table(["Run", "Environment steps [1]", *map(label_of, columns)], lines, caption=caption)
 
 

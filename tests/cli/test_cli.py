@@ -19,6 +19,7 @@ from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.methods import METHODS, method
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
+from cura_torchrl.trainers.report_config import ReportConfig
 from cura_torchrl.trainers.table_config import TableConfig
 
 if TYPE_CHECKING:
@@ -55,7 +56,19 @@ def test_help_lists_every_command_and_method() -> None:
     """Catches a command that nobody finds."""
     done = run("--help")
     assert done.returncode == 0
-    for name in ("pretrain-map", "imitate", "train", "evaluate", "table", "release", "demo", "bench", "info", *METHODS):
+    for name in (
+        "pretrain-map",
+        "imitate",
+        "train",
+        "evaluate",
+        "table",
+        "report",
+        "release",
+        "demo",
+        "bench",
+        "info",
+        *METHODS,
+    ):
         assert name in done.stdout
 
 
@@ -65,6 +78,7 @@ def test_help_lists_every_command_and_method() -> None:
         ("train", TrainConfig),
         ("evaluate", EvaluateConfig),
         ("table", TableConfig),
+        ("report", ReportConfig),
         ("demo", DemoConfig),
         ("bench", BenchConfig),
     ],
@@ -74,7 +88,7 @@ def test_help_lists_every_field(command: str, config: type[object]) -> None:
     done = run(command, "--help")
     assert done.returncode == 0
     words = done.stdout.replace("│", " ").replace(",", " ").split()
-    positional = {"--target"}
+    positional = {"--target", "--runs"}
     assert [flag for flag in flags(config) if flag not in words and flag not in positional] == []
 
 
@@ -110,6 +124,13 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
         (["table", "--methods", "push,cura"], "method is 'cura'; accepted: cura-no-risk, "),
         (["table", "--cells", "uniform-0.5", "uniform-9"], "cell is 'uniform-9'; accepted: all, or SCENARIO-SIZE"),
         (["table", "--methods", "push", "--seeds", "7", "--runs", "{tmp}", "--out", "{tmp}"], "no checkpoint at"),
+        (["report"], "RUNS"),
+        (["report", "{tmp}/none"], "no checkpoint at"),
+        (["report", "push", "--table", "{tmp}"], "no table.md in"),
+        (["report", "push", "--calibration", "{tmp}"], "no calibration.md in"),
+        (["report", "push", "--curves", "{tmp}/none.csv"], "no rows of progress in"),
+        (["report", "push", "--out", "{tmp}"], "a folder; accepted: a file to write"),
+        (["report", "push", "--object-size", "3"], "object_size is 3.0; accepted: 0.3 to 1.2 m"),
         (["bench"], "env,learner,lidar,ik,peers"),
         (["bench", "speed"], "speed"),
         (["bench", "env", "--rounds", "0"], "rounds is 0; accepted: 1 or more"),
