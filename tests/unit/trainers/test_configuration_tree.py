@@ -35,7 +35,7 @@ def test_what_differs_stands_out_with_both_values() -> None:
     assert page.count('<tr class="marked">') == 2
     assert page.count("<details open>") == 2  # env and env.task
     rows = Reader(page).rows
-    assert ["num_envs", "4,096", "64"] == next(row[:3] for row in rows if row[0] == "num_envs")
+    assert next(row[1:3] for row in rows if row[0] == "num_envs") == ["4,096", "64"]
     assert next(row[1:3] for row in rows if row[0] == "episode_time") == ["7.0", str(base.env.task.episode_time)]
 
 

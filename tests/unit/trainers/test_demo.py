@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import logging
 from typing import TYPE_CHECKING
 
 import pytest
-import torch
 from PIL import Image
 
-from cura_torchrl.modules import MapVAE
-from cura_torchrl.trainers.build import Networks
-from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint, read_config, save_checkpoint
-from cura_torchrl.trainers.config import NetworkConfig
+from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config
 from cura_torchrl.trainers.demo import PAGE_NAME, TRAINING_FOLDER, DemoConfig, demo, most_telling
 from cura_torchrl.trainers.errors import RunError
-from cura_torchrl.trainers.methods import METHODS, method
+from cura_torchrl.trainers.methods import METHODS
 from cura_torchrl.trainers.progress import read_progress
 from tests.recordings import make_recording
-from tests.runs import TINY_FRAMES as FRAMES
 from tests.runs import tiny_run
 
 if TYPE_CHECKING:
