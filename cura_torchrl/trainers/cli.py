@@ -28,6 +28,7 @@ from cura_torchrl.trainers.info import capabilities, git_commit, hardware, shipp
 from cura_torchrl.trainers.methods import METHODS, method
 from cura_torchrl.trainers.report_config import ReportConfig
 from cura_torchrl.trainers.table_config import TableConfig
+from cura_torchrl.trainers.view_config import ViewConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -221,6 +222,14 @@ def _report(arguments: list[str]) -> None:
     sys.stdout.write(f"{page}\n")
 
 
+def _view(arguments: list[str]) -> None:
+    """Play scenes in the browser, step by step."""
+    config = _parse(ViewConfig, "view", arguments)
+    module = _import("cura_torchrl.trainers.view")
+    with _clean_stdout():
+        module.view(config)
+
+
 def _defaults(arguments: list[str]) -> TrainConfig:
     """Return what the flags of ``train`` start from: the method's preset, or the run's own configuration."""
     scout = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -313,6 +322,7 @@ _COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "evaluate": _evaluate,
     "table": _table,
     "report": _report,
+    "view": _view,
     "release": _release,
     "demo": _demo,
     "bench": _bench,

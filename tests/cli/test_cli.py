@@ -21,6 +21,7 @@ from cura_torchrl.trainers.methods import METHODS, method
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.report_config import ReportConfig
 from cura_torchrl.trainers.table_config import TableConfig
+from cura_torchrl.trainers.view_config import ViewConfig
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -79,6 +80,7 @@ def test_help_lists_every_command_and_method() -> None:
         ("evaluate", EvaluateConfig),
         ("table", TableConfig),
         ("report", ReportConfig),
+        ("view", ViewConfig),
         ("demo", DemoConfig),
         ("bench", BenchConfig),
     ],
