@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import itertools
 import logging
 import time
 from contextlib import closing
@@ -107,12 +108,13 @@ class View:
                 return
             time.sleep(_WAIT)
 
-    def show(self, recording: Recording, step: int) -> None:
+    def show(self, recording: Recording, step: int, *, passed: float = 0.0) -> None:
         """Show one state.
 
         Args:
             recording: What is shown; of maps and scans it needs those of the state.
             step: Index of the state [1].
+            passed: Time of the scene that passed before the recording [s].
         """
         base, tcp, edge = recording.base_pose[step], recording.tcp[step], recording.scene.object_edge
         self._box("robot/chassis", base, (*model.CHASSIS_SIZE, _HEIGHT), raster.ROBOT)
@@ -130,7 +132,7 @@ class View:
         picture = map_image(recording.maps[frame, 0], raster.CONFIDENCE_COLOURS, _MAP_PIXELS)
         self._map.image = np.asarray(picture)
         self._text.content = (
-            f"scene {recording.scene.index}, t = {recording.times[step]:.1f} s  \n"
+            f"scene {recording.scene.index}, t = {passed + recording.times[step]:.1f} s  \n"
             f"risk R = {recording.risk[step]:.3f}  \nuncertainty U = {recording.uncertainty[step]:.4f}"
         )
 
@@ -202,11 +204,13 @@ def play_scene(config: ViewConfig, loaded: LoadedPolicy, shown: View) -> None:
 
 
 def _show_live(loaded: LoadedPolicy, env: EnvBase, scene: Scene, shown: View) -> None:
+    states = itertools.count()
+
     def look(state: TensorDictBase, is_playing: torch.Tensor) -> None:
         recorder = Recorder(loaded.collision_estimator, 1, stride=1)
         recorder(state, is_playing)
         (recording,) = recorder.recordings([None], [scene], label="", env=env)  # type: ignore[list-item]
-        shown.show(recording, 0)
+        shown.show(recording, 0, passed=next(states) * recording.period)
         shown.wait(recording.period, scene.index)
 
     play_episodes(env, loaded.policy, torch.tensor([scene.index]), watch=look)

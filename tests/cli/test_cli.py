@@ -57,19 +57,8 @@ def test_help_lists_every_command_and_method() -> None:
     """Catches a command that nobody finds."""
     done = run("--help")
     assert done.returncode == 0
-    for name in (
-        "pretrain-map",
-        "imitate",
-        "train",
-        "evaluate",
-        "table",
-        "report",
-        "release",
-        "demo",
-        "bench",
-        "info",
-        *METHODS,
-    ):
+    commands = "pretrain-map imitate train evaluate table report view release demo bench info".split()
+    for name in (*commands, *METHODS):
         assert name in done.stdout
 
 
@@ -126,6 +115,8 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
         (["table", "--methods", "push,cura"], "method is 'cura'; accepted: cura-no-risk, "),
         (["table", "--cells", "uniform-0.5", "uniform-9"], "cell is 'uniform-9'; accepted: all, or SCENARIO-SIZE"),
         (["table", "--methods", "push", "--seeds", "7", "--runs", "{tmp}", "--out", "{tmp}"], "no checkpoint at"),
+        (["view", "--port", "0"], "port is 0; accepted: 1 to 65535"),
+        (["view", "--speed", "-1"], "speed is -1.0; accepted: a positive number"),
         (["report"], "RUNS"),
         (["report", "{tmp}/none"], "no checkpoint at"),
         (["report", "push", "--table", "{tmp}"], "no table.md in"),

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from cura_torchrl.trainers.recording import Recording
+
 needs_viser = pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="the extra live is not installed")
 
 
@@ -63,11 +65,17 @@ def test_a_state_is_shown_where_it_is(shown: View) -> None:
 def test_a_scene_is_played_to_its_end(recorded: bool, shown: View, tmp_path: Path) -> None:
     """Catches an episode that stops, states that are not shown, and a next scene that does not come."""
     states = []
-    show, shown.show = shown.show, lambda recording, step: (states.append(step), show(recording, step))  # type: ignore[method-assign]
+    show = shown.show
+
+    def note(recording: Recording, step: int, *, passed: float = 0.0) -> None:
+        states.append(round(passed + recording.times[step], 3))
+        show(recording, step, passed=passed)
+
+    shown.show = note  # type: ignore[method-assign]
     loaded = load_policy(tiny_run("push", tmp_path))
     play_scene(ViewConfig(speed=20.0, recorded=recorded), loaded, shown)
     # Episodes last 1 s: five steps of 0.2 s, six states.
-    assert states == ([0, 1, 2, 3, 4, 5] if recorded else [0] * 6)
+    assert states == [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
     assert shown.scene_index.value == 1
 
 
@@ -77,8 +85,8 @@ def test_a_chosen_scene_ends_the_one_before(shown: View, tmp_path: Path) -> None
     shown.playing.value = False
     show = shown.show
 
-    def choose(recording: object, step: int) -> None:
-        show(recording, step)  # type: ignore[arg-type]
+    def choose(recording: Recording, step: int, *, passed: float = 0.0) -> None:
+        show(recording, step, passed=passed)
         shown.scene_index.value = 7
 
     shown.show = choose  # type: ignore[assignment,method-assign]
