@@ -229,7 +229,7 @@ def find_scene(config: ScenarioConfig, *, seed: int, index: int | None = None) -
     Args:
         config: Layout.
         seed: Seed of the scenarios.
-        index: Index of the scenario in the stream [1]; None is the first one with an obstacle, where there may be any.
+        index: Index of the scenario in the stream [1]; None is the first one with the most obstacles.
 
     Returns:
         The scene.
@@ -242,7 +242,7 @@ def find_scene(config: ScenarioConfig, *, seed: int, index: int | None = None) -
     if index is not None:
         return _scene(index, _draw(config, seed, torch.tensor([index]))[0])
     drawn = _draw(config, seed, torch.arange(_SEARCHED))
-    first = int((drawn["num_obstacles"] >= min(1, config.max_obstacles)).int().argmax())
+    first = int((drawn["num_obstacles"] == drawn["num_obstacles"].max()).int().argmax())
     return _scene(first, drawn[first])
 
 

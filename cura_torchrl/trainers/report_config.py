@@ -28,7 +28,7 @@ class ReportConfig:
     baseline: str | None = "push"
     """Who plays the scene beside the run, and whose curves are drawn beside its own: as for runs; None is nobody."""
     scene: int | None = None
-    """Index of the scene in the evaluation stream [1]; None is the first one with an obstacle."""
+    """Index of the scene in the evaluation stream [1]; None is the first one with K obstacles."""
     scenario: ScenarioKind = "adversarial"
     """Where obstacles appear in the scene."""
     object_size: float = 1.0

@@ -8,9 +8,11 @@ import re
 from typing import TYPE_CHECKING
 
 import pytest
+import torch
 from PIL import Image
 
 from cura_torchrl.envs.config import ScenarioConfig
+from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.trainers import report as report_module
 from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.errors import RunError
@@ -148,9 +150,17 @@ def test_a_table_of_other_weights_is_called_so(folder: Path, tmp_path: Path) -> 
 
 
 def test_a_scene_is_found_by_its_index() -> None:
-    """Catches a scene other than the one that evaluate plays, and a first scene without obstacles."""
+    """Catches a scene other than the one that evaluate plays, and a scene that shows little by default."""
     chosen = choose_scenes(ScenarioConfig(kind="mixed"), seed=5, count=1)
     for scene in chosen:
         assert find_scene(ScenarioConfig(kind="mixed"), seed=5, index=scene.index) == scene
-    first = find_scene(ScenarioConfig(kind="mixed"), seed=5)
-    assert first.index <= min(scene.index for scene in chosen)
+    drawn = scenarios.sample_scenarios(
+        ScenarioConfig(kind="mixed"),
+        stream="eval",
+        seed=5,
+        episodes=torch.arange(100),
+        max_obstacles=6,
+        tcp_reach=0.9,
+    )
+    first = next(index for index, count in enumerate(drawn["num_obstacles"].tolist()) if count == 6)
+    assert find_scene(ScenarioConfig(kind="mixed"), seed=5).index == first
