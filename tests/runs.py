@@ -5,6 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
+import torch
+
+from cura_torchrl.modules import MapVAE
+from cura_torchrl.trainers.build import Networks
+from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
+from cura_torchrl.trainers.config import NetworkConfig
 from cura_torchrl.trainers.methods import method
 
 if TYPE_CHECKING:
@@ -14,6 +20,8 @@ if TYPE_CHECKING:
 
 FRAMES = 8
 """Frames of one rollout: two worlds, four steps."""
+TINY_FRAMES = 3000
+"""Steps that the tiny runs claim to have been trained for."""
 
 
 def small_run(run_dir: Path, *, updates: int, **changes: Any) -> TrainConfig:
@@ -30,3 +38,23 @@ def small_run(run_dir: Path, *, updates: int, **changes: Any) -> TrainConfig:
         network=dataclasses.replace(preset.network, **sizes),
         **changes,
     )
+
+
+def tiny_run(name: str, folder: Path) -> Path:
+    """Write a run of untrained networks with short episodes, and return its folder."""
+    encoder = folder / "map_vae.pt"
+    torch.manual_seed(1)
+    MapVAE().save(encoder)
+    preset = method(name)
+    task = dataclasses.replace(preset.env.task, episode_time=1.0, curriculum=((0, 0), (2000, 1), (9000, 6)))
+    small = NetworkConfig(actor_hidden_sizes=(8,), critic_hidden_sizes=(8,), collision_hidden_sizes=(8,))
+    config = preset.replace(
+        run_dir=folder / name,
+        encoder=encoder,
+        env=dataclasses.replace(preset.env, task=task),
+        ppo=dataclasses.replace(preset.ppo, rollout_steps=4, epochs=1, lr=1e-3),
+        network=small,
+    )
+    save_checkpoint({"networks": Networks(config)}, config, config.run_dir / CHECKPOINT_FOLDER, frames=TINY_FRAMES)
+    (config.run_dir / "progress.csv").write_text("frames,reward,lr\n2000,1.0,0.002\n3000,1.5,0.003\n")
+    return config.run_dir

@@ -216,6 +216,11 @@ class LoadedPolicy:
     path: Path
     """Where the networks came from."""
 
+    @property
+    def weights_sha256(self) -> str:
+        """SHA-256 of the checkpoint's list of hashes: what tells these weights from others."""
+        return _sha256(self.path / SUMS_NAME)
+
     def make_env(
         self,
         num_envs: int,

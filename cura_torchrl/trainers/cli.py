@@ -28,8 +28,10 @@ from cura_torchrl.trainers.errors import RunError, RunsFailedError
 from cura_torchrl.trainers.export_config import ExportConfig
 from cura_torchrl.trainers.info import capabilities, git_commit, hardware, shipped_methods, versions
 from cura_torchrl.trainers.methods import PRESETS, method
+from cura_torchrl.trainers.report_config import ReportConfig
 from cura_torchrl.trainers.table_config import TableConfig
 from cura_torchrl.trainers.train_all_config import PlannedRun, TrainAllConfig
+from cura_torchrl.trainers.view_config import ViewConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -270,6 +272,23 @@ def _table(arguments: list[str]) -> None:
     sys.stdout.write(page)
 
 
+def _report(arguments: list[str]) -> None:
+    """Write a page about a trained policy, to look at and to send around."""
+    config = _parse(ReportConfig, "report", arguments)
+    module = _import("cura_torchrl.trainers.report")
+    with _clean_stdout():
+        page = module.report(config)
+    sys.stdout.write(f"{page}\n")
+
+
+def _view(arguments: list[str]) -> None:
+    """Play scenes in the browser, step by step."""
+    config = _parse(ViewConfig, "view", arguments)
+    module = _import("cura_torchrl.trainers.view")
+    with _clean_stdout():
+        module.view(config)
+
+
 def _defaults(arguments: list[str]) -> TrainConfig:
     """Return what the flags of ``train`` start from: the method's preset, or the run's own configuration."""
     scout = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -362,6 +381,8 @@ _COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "train-all": _train_all,
     "evaluate": _evaluate,
     "table": _table,
+    "report": _report,
+    "view": _view,
     "release": _release,
     "export": _export,
     "demo": _demo,

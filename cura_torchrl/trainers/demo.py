@@ -254,21 +254,22 @@ def _draw(config: DemoConfig, pairs: Sequence[_Pair], workers: Executor) -> list
     return cards
 
 
-def draw_card(pair: _Pair, *, every: int) -> Card:
+def draw_card(recordings: tuple[Recording, ...], *, every: int, frame_time: float = _FRAME_TIME) -> Card:
     """Draw a scene.
 
     Args:
-        pair: The scene as both policies played it.
+        recordings: The scene as each policy played it.
         every: Every how many recorded frames are shown [1].
+        frame_time: Time for which each recorded frame would be shown [s].
 
     Returns:
         The scene with its pictures.
     """
-    frames = render.animation_frames(pair, every=every)
+    frames = render.animation_frames(recordings, every=every)
     return Card(
-        recordings=pair,
-        paths=figures.paths_figure(pair),
-        animation=render.encode_animation(frames, frame_time=every * _FRAME_TIME),
+        recordings=recordings,
+        paths=figures.paths_figure(recordings),
+        animation=render.encode_animation(frames, frame_time=every * frame_time),
     )
 
 

@@ -58,7 +58,7 @@ def paths_figure(recordings: Sequence[Recording]) -> bytes:
         axis.set_title(f"{recording.label}: {recording.describe()}", fontsize=10, loc="left")
     axes[0].set_ylabel("y [m]")
     _set_margins(figure)
-    return _png(figure)
+    return encode_png(figure)
 
 
 def snapshots_figure(recordings: Sequence[Recording]) -> bytes:
@@ -86,7 +86,7 @@ def snapshots_figure(recordings: Sequence[Recording]) -> bytes:
         for row, channel in ((1, 0), (2, -1)):
             axes = [figure.add_subplot(grid[row, column]) for column in range(3)]
             _draw_maps(axes, recording, frames, channel=channel)
-    return _png(figure)
+    return encode_png(figure)
 
 
 def distribution_figure(recordings: Sequence[Recording]) -> bytes:
@@ -111,12 +111,12 @@ def distribution_figure(recordings: Sequence[Recording]) -> bytes:
             axis.axvline(risk, color=raster.RISK, linewidth=1.8)
             title = f"{name}: t = {recording.times[step]:.1f} s, R = {two_digits(risk)}, U = {uncertainty:.3f}"
             axis.set_title(title, fontsize=9, loc="left")
-            _tidy(axis)
+            tidy(axis)
         row[0].set_ylabel(f"{recording.label}\nshare of atoms [1]")
     for axis in axes[-1]:
         axis.set_xlabel("collision possibility C [1]")
     _set_margins(figure, left=0.85)
-    return _png(figure)
+    return encode_png(figure)
 
 
 def layout_figure(config: ScenarioConfig) -> bytes:
@@ -146,7 +146,7 @@ def layout_figure(config: ScenarioConfig) -> bytes:
     _frame_world(axis)
     axis.set_ylabel("y [m]")
     _set_margins(figure, top=0.15)
-    return _png(figure)
+    return encode_png(figure)
 
 
 def _draw_sizes(axis: Any, config: ScenarioConfig) -> None:
@@ -184,7 +184,7 @@ def curve_figure(before: Sequence[dict[str, float]], after: Sequence[dict[str, f
             points = [(row["frames"] / unit, row[name]) for row in rows if math.isfinite(row.get(name, math.nan))]
             if points:
                 axis.plot(*np.array(points).T, color=colour, **style)
-            _tidy(axis)
+            tidy(axis)
         pair[1].tick_params(labelleft=False)
         pair[1].xaxis.set_major_locator(MaxNLocator(3))
         pair[0].set_title(label, fontsize=10, loc="left")
@@ -193,7 +193,36 @@ def curve_figure(before: Sequence[dict[str, float]], after: Sequence[dict[str, f
         pair[0].set_xlabel("environment steps [million]")
         pair[1].set_xlabel("steps [thousand]")
     _set_margins(figure)
-    return _png(figure)
+    return encode_png(figure)
+
+
+def encode_png(figure: Figure) -> bytes:
+    """Return a figure as a PNG file.
+
+    Args:
+        figure: The figure.
+
+    Returns:
+        Content of the file, with a palette of 256 colours, which makes a third of the size.
+    """
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=_DOTS, facecolor="white")
+    image = Image.open(drawn).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    packed = io.BytesIO()
+    image.save(packed, "PNG", optimize=True)
+    return packed.getvalue()
+
+
+def tidy(axis: Any) -> None:
+    """Give an axis the look of all figures.
+
+    Args:
+        axis: A matplotlib axis; changed in place.
+    """
+    axis.grid(color=raster.GRID, linewidth=0.6)
+    axis.set_axisbelow(True)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.tick_params(labelsize=9)
 
 
 def telling_frames(recording: Recording) -> list[int]:
@@ -290,27 +319,10 @@ def _write(axis: Any, text: str, place: Any, *, up: float = 2.0, **options: Any)
 def _frame_world(axis: Any) -> None:
     axis.set(xlim=_WORLD_X, ylim=_WORLD_Y, aspect="equal", xlabel="x [m]")
     axis.set_xticks(range(-2, 17, 2))
-    _tidy(axis)
-
-
-def _tidy(axis: Any) -> None:
-    axis.grid(color=raster.GRID, linewidth=0.6)
-    axis.set_axisbelow(True)
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.tick_params(labelsize=9)
+    tidy(axis)
 
 
 def _set_margins(figure: Figure, *, left: float = 0.6, right: float = 0.15, top: float = 0.35) -> None:
     """Set the margins [inch]; matplotlib's automatic layout takes longer than all the rest of a figure."""
     width, height = figure.get_size_inches()
     figure.subplots_adjust(left / width, 0.55 / height, 1 - right / width, 1 - top / height)
-
-
-def _png(figure: Figure) -> bytes:
-    # A palette of 256 colours makes a third of the size.
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=_DOTS, facecolor="white")
-    image = Image.open(drawn).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    packed = io.BytesIO()
-    image.save(packed, "PNG", optimize=True)
-    return packed.getvalue()

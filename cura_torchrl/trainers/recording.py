@@ -188,24 +188,10 @@ def choose_scenes(config: ScenarioConfig, *, seed: int, count: int) -> list[Scen
         >>> [scene.kind for scene in choose_scenes(ScenarioConfig(), seed=0, count=1)]
         ['adversarial', 'uniform']
     """
-    drawn = scenarios.sample_scenarios(
-        config,
-        stream="eval",
-        seed=seed,
-        episodes=torch.arange(_SEARCHED),
-        max_obstacles=config.max_obstacles,
-        tcp_reach=model.HOME_TCP[0],
-    )
+    drawn = _draw(config, seed, torch.arange(_SEARCHED))
     found: dict[tuple[bool, float], list[Scene]] = defaultdict(list)
     for index in (drawn["num_obstacles"] >= min(1, config.max_obstacles)).nonzero().flatten().tolist():
-        row = drawn[index]
-        x, y, yaw = row["goal_pose"].tolist()
-        scene = Scene(
-            index=index,
-            adversarial=bool(row["adversarial"]),
-            object_edge=float(row["object_edge"]),
-            goal_pose=(x, y, yaw),
-        )
+        scene = _scene(index, drawn[index])
         found[scene.adversarial, scene.object_edge].append(scene)
     chosen = []
     for adversarial in (True, False):
@@ -217,6 +203,50 @@ def choose_scenes(config: ScenarioConfig, *, seed: int, count: int) -> list[Scen
                 raise ValueError(msg)
             chosen.append(same[turn])
     return chosen
+
+
+def find_scene(config: ScenarioConfig, *, seed: int, index: int | None = None) -> Scene:
+    """Return a scenario of the evaluation stream.
+
+    Args:
+        config: Layout.
+        seed: Seed of the scenarios.
+        index: Index of the scenario in the stream [1]; None is the first one with the most obstacles.
+
+    Returns:
+        The scene.
+
+    Examples:
+        >>> from cura_torchrl.envs.config import ScenarioConfig
+        >>> find_scene(ScenarioConfig(kind="uniform", object_edges=(0.75,)), seed=0, index=7).object_edge
+        0.75
+    """
+    if index is not None:
+        return _scene(index, _draw(config, seed, torch.tensor([index]))[0])
+    drawn = _draw(config, seed, torch.arange(_SEARCHED))
+    first = int((drawn["num_obstacles"] == drawn["num_obstacles"].max()).int().argmax())
+    return _scene(first, drawn[first])
+
+
+def _draw(config: ScenarioConfig, seed: int, episodes: torch.Tensor) -> TensorDictBase:
+    return scenarios.sample_scenarios(
+        config,
+        stream="eval",
+        seed=seed,
+        episodes=episodes,
+        max_obstacles=config.max_obstacles,
+        tcp_reach=model.HOME_TCP[0],
+    )
+
+
+def _scene(index: int, row: TensorDictBase) -> Scene:
+    x, y, yaw = row["goal_pose"].tolist()
+    return Scene(
+        index=index,
+        adversarial=bool(row["adversarial"]),
+        object_edge=float(row["object_edge"]),
+        goal_pose=(x, y, yaw),
+    )
 
 
 class Recorder:

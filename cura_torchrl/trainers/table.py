@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import itertools
 import sys
 from contextlib import closing
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from cura_torchrl.trainers.agreement import agreement, pair
-from cura_torchrl.trainers.checkpoint import SUMS_NAME, load_policy
+from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.config import EvaluateConfig
 from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
 from cura_torchrl.trainers.evaluate import Episode, Part, parts_of, play_parts
@@ -75,9 +74,13 @@ def _policies(config: TableConfig) -> list[_Policy]:
         if loaded.config.method != method:
             msg = f"checkpoint {loaded.path} is of method {loaded.config.method}; accepted: a run of {method}"
             raise CheckpointError(msg)
-        sha256 = hashlib.sha256((loaded.path / SUMS_NAME).read_bytes()).hexdigest()
-        frames, commit = loaded.record["frames"], loaded.record["commit"]
-        record = PolicyRecord(method=method, training_seed=seed, weights_sha256=sha256, frames=frames, commit=commit)
+        record = PolicyRecord(
+            method=method,
+            training_seed=seed,
+            weights_sha256=loaded.weights_sha256,
+            frames=loaded.record["frames"],
+            commit=loaded.record["commit"],
+        )
         found.append(_Policy(record=record, path=loaded.path))
     return found
 

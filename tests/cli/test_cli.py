@@ -20,10 +20,12 @@ from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.export_config import ExportConfig
 from cura_torchrl.trainers.methods import PRESETS, method
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
+from cura_torchrl.trainers.report_config import ReportConfig
 from cura_torchrl.trainers.run_folder import is_locked
 from cura_torchrl.trainers.run_status import read_record
 from cura_torchrl.trainers.table_config import TableConfig
 from cura_torchrl.trainers.train_all_config import TrainAllConfig
+from cura_torchrl.trainers.view_config import ViewConfig
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -60,7 +62,7 @@ def test_help_lists_every_command_and_method() -> None:
     done = run("--help")
     assert done.returncode == 0
     learning = ("pretrain-map", "imitate", "train", "train-all")
-    others = ("evaluate", "table", "release", "export", "demo", "bench", "info")
+    others = ("evaluate", "table", "report", "view", "release", "export", "demo", "bench", "info")
     for name in (*learning, *others, *PRESETS):
         assert name in done.stdout
 
@@ -72,6 +74,8 @@ def test_help_lists_every_command_and_method() -> None:
         ("train-all", TrainAllConfig),
         ("evaluate", EvaluateConfig),
         ("table", TableConfig),
+        ("report", ReportConfig),
+        ("view", ViewConfig),
         ("demo", DemoConfig),
         ("export", ExportConfig),
         ("bench", BenchConfig),
@@ -82,7 +86,7 @@ def test_help_lists_every_field(command: str, config: type[object]) -> None:
     done = run(command, "--help")
     assert done.returncode == 0
     words = done.stdout.replace("│", " ").replace(",", " ").split()
-    positional = {"--target"}
+    positional = {"--target", "--runs"}
     assert [flag for flag in flags(config) if flag not in words and flag not in positional] == []
 
 
@@ -126,6 +130,15 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
         (["train-all", "--init-from", "push={tmp}/none"], "no checkpoint at"),
         (["train-all", "--runs", "{tmp}", "--", "--seed", "3"], "flag after -- is '--seed'; accepted: the flags of"),
         (["train-all", "--runs", "{tmp}", "--", "--num-evns", "3"], "Unrecognized options: --num-evns"),
+        (["view", "--port", "0"], "port is 0; accepted: 1 to 65535"),
+        (["view", "--speed", "-1"], "speed is -1.0; accepted: a positive number"),
+        (["report"], "RUNS"),
+        (["report", "{tmp}/none"], "no checkpoint at"),
+        (["report", "push", "--table", "{tmp}"], "no table.md in"),
+        (["report", "push", "--calibration", "{tmp}"], "no calibration.md in"),
+        (["report", "push", "--curves", "{tmp}/none.csv"], "no rows of progress in"),
+        (["report", "push", "--out", "{tmp}"], "a folder; accepted: a file to write"),
+        (["report", "push", "--object-size", "3"], "object_size is 3.0; accepted: 0.3 to 1.2 m"),
         (["bench"], "env,learner,lidar,ik,peers"),
         (["bench", "speed"], "speed"),
         (["bench", "env", "--rounds", "0"], "rounds is 0; accepted: 1 or more"),

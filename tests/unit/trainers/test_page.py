@@ -5,12 +5,12 @@ from __future__ import annotations
 import base64
 import io
 import re
-from html.parser import HTMLParser
 
 import pytest
 from PIL import Image
 
 from cura_torchrl.trainers.page import Card, make_page, summary_table
+from tests.pages import Reader
 from tests.recordings import make_episode, make_recording
 
 
@@ -28,37 +28,6 @@ def card(first: str, second: str, *, index: int, adversarial: bool = True, **cha
         make_recording(outcome=second, index=index, adversarial=adversarial, label="Second"),
     )
     return Card(recordings=recordings, paths=picture("PNG"), animation=picture("WEBP"))
-
-
-class Reader(HTMLParser):
-    """Collects what a page refers to, its pictures and the cells of its tables."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__()
-        self.references: list[str] = []
-        self.tags: list[str] = []
-        self.rows: list[list[str]] = []
-        self._is_cell = False
-        self.feed(page)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Note references and the start of rows and cells."""
-        self.tags.append(tag)
-        self.references += [value or "" for name, value in attrs if name in {"src", "href", "srcset", "data", "poster"}]
-        if tag == "tr":
-            self.rows.append([])
-        self._is_cell = tag in {"td", "th"}
-        if self._is_cell:
-            self.rows[-1].append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        """Note the end of a cell."""
-        self._is_cell &= tag not in {"td", "th"}
-
-    def handle_data(self, data: str) -> None:
-        """Add text to the cell."""
-        if self._is_cell:
-            self.rows[-1][-1] += data
 
 
 @pytest.fixture(scope="module")
