@@ -26,6 +26,7 @@ from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.info import capabilities, git_commit, hardware, shipped_methods, versions
 from cura_torchrl.trainers.methods import METHODS, method
+from cura_torchrl.trainers.render_config import RenderConfig
 from cura_torchrl.trainers.table_config import TableConfig
 
 if TYPE_CHECKING:
@@ -202,6 +203,15 @@ def _demo(arguments: list[str]) -> None:
     sys.stdout.write(f"{page}\n")
 
 
+def _render(arguments: list[str]) -> None:
+    """Play one scene and write the paper's figures of it and animations."""
+    config = _parse(RenderConfig, "render", arguments)
+    module = _import("cura_torchrl.trainers.render")
+    with _clean_stdout():
+        files = module.render(config)
+    sys.stdout.write("".join(f"{file}\n" for file in files))
+
+
 def _table(arguments: list[str]) -> None:
     """Play methods in all cells and write the table of success rates."""
     config = _parse(TableConfig, "table", arguments)
@@ -302,6 +312,7 @@ _COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "train": _train,
     "evaluate": _evaluate,
     "table": _table,
+    "render": _render,
     "release": _release,
     "demo": _demo,
     "bench": _bench,

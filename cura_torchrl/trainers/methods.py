@@ -5,9 +5,15 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from cura_torchrl.envs.config import MapConfig, PushEnvConfig
 from cura_torchrl.trainers.config import CURAConfig, TrainConfig
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from cura_torchrl.trainers.checkpoint import LoadedPolicy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,3 +86,18 @@ def method(name: str) -> TrainConfig:
         map=MapConfig(decay=preset.decay),
         cura=CURAConfig(risk_coeff=preset.risk_coeff, uncertainty_coeff=preset.uncertainty_coeff),
     )
+
+
+def policy_labels(loaded: Sequence[LoadedPolicy]) -> list[str]:
+    """Return what policies are called in figures.
+
+    Args:
+        loaded: The policies.
+
+    Returns:
+        Their methods' names, with the steps of training where two would be the same.
+    """
+    labels = [METHODS[policy.config.method].label for policy in loaded]
+    if len(set(labels)) == len(labels):
+        return labels
+    return [f"{label} ({policy.record['frames']:,} steps)" for label, policy in zip(labels, loaded, strict=True)]

@@ -88,8 +88,8 @@ class TableConfig:
 
     def __post_init__(self) -> None:
         require_finite(self)
-        object.__setattr__(self, "methods", _split(self.methods))
-        object.__setattr__(self, "cells", tuple(cell.name for cell in _cells(_split(self.cells))))
+        object.__setattr__(self, "methods", split_names(self.methods))
+        object.__setattr__(self, "cells", tuple(cell.name for cell in _cells(split_names(self.cells))))
         require(bool(self.methods), "methods", self.methods, "one or more methods")
         require(bool(self.cells), "cells", self.cells, _CELL_NAMES)
         accepted = tuple(METHODS) if self.seeds else tuple(shipped_methods())
@@ -105,8 +105,19 @@ class TableConfig:
         require(are_seeds, "seeds", self.seeds, "different ones of 0 to 2147483647")
 
 
-def _split(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names, each once, those that are joined by commas apart."""
+def split_names(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names, each once, those that are joined by commas apart.
+
+    Args:
+        names: Names, some of them joined by commas.
+
+    Returns:
+        The names.
+
+    Examples:
+        >>> split_names(["push,cura-ppo", "push"])
+        ('push', 'cura-ppo')
+    """
     return tuple(dict.fromkeys(part.strip() for name in names for part in name.split(",") if part.strip()))
 
 

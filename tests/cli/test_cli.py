@@ -19,6 +19,7 @@ from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.methods import METHODS, method
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
+from cura_torchrl.trainers.render_config import RenderConfig
 from cura_torchrl.trainers.table_config import TableConfig
 
 if TYPE_CHECKING:
@@ -55,7 +56,19 @@ def test_help_lists_every_command_and_method() -> None:
     """Catches a command that nobody finds."""
     done = run("--help")
     assert done.returncode == 0
-    for name in ("pretrain-map", "imitate", "train", "evaluate", "table", "release", "demo", "bench", "info", *METHODS):
+    for name in (
+        "pretrain-map",
+        "imitate",
+        "train",
+        "evaluate",
+        "table",
+        "render",
+        "release",
+        "demo",
+        "bench",
+        "info",
+        *METHODS,
+    ):
         assert name in done.stdout
 
 
@@ -65,6 +78,7 @@ def test_help_lists_every_command_and_method() -> None:
         ("train", TrainConfig),
         ("evaluate", EvaluateConfig),
         ("table", TableConfig),
+        ("render", RenderConfig),
         ("demo", DemoConfig),
         ("bench", BenchConfig),
     ],
@@ -110,6 +124,12 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
         (["table", "--methods", "push,cura"], "method is 'cura'; accepted: cura-no-risk, "),
         (["table", "--cells", "uniform-0.5", "uniform-9"], "cell is 'uniform-9'; accepted: all, or SCENARIO-SIZE"),
         (["table", "--methods", "push", "--seeds", "7", "--runs", "{tmp}", "--out", "{tmp}"], "no checkpoint at"),
+        (["render", "--methods", "push,cura"], "method is 'cura'; accepted: cura-no-risk, "),
+        (["render", "--methods", "{tmp}"], "no checkpoint at"),
+        (["render", "--scene", "-1"], "scene is -1; accepted: 0 to 2147483647"),
+        (["render", "--formats", "png,jpg"], "format is 'jpg'; accepted: png, svg, mp4, gif, webp"),
+        (["render", "--figures", "path"], "figure is 'path'; accepted: all, none, paths, snapshots, "),
+        (["render", "--times", "3", "1"], "times is (3.0, 1.0); accepted: at most 6 growing times [s]"),
         (["bench"], "env,learner,lidar,ik,peers"),
         (["bench", "speed"], "speed"),
         (["bench", "env", "--rounds", "0"], "rounds is 0; accepted: 1 or more"),
