@@ -6,11 +6,17 @@ from typing import Any
 
 import numpy as np
 
+from cura_torchrl.envs.robots.ridgeback_franka import HOME
 from cura_torchrl.trainers.evaluate import Episode
 from cura_torchrl.trainers.recording import Recording, Scene
 
 NUM_STATES = 7
 """States of a recording; frames are states 0, 3 and 6."""
+
+TRACKS = (
+    "base_pose", "tcp", "object_pose", "obstacles", "arm_joints", "object_position", "object_quaternion", "atoms",
+)  # fmt: skip
+"""What a recording has of every state."""
 
 
 def make_episode(*, index: int = 4, outcome: str = "success", steps: int = 6) -> Episode:
@@ -49,6 +55,9 @@ def make_recording(*, outcome: str = "success", index: int = 4, adversarial: boo
         "tcp": np.stack([along + 0.9, zero], -1),
         "object_pose": np.stack([along + 1.5, zero, zero], -1),
         "obstacles": obstacles,
+        "arm_joints": np.tile(HOME, (NUM_STATES, 1)),
+        "object_position": np.stack([along + 1.5, zero, zero + 0.5], -1),
+        "object_quaternion": np.tile([0.0, 0.0, 0.0, 1.0], (NUM_STATES, 1)),
         "atoms": np.tile([0.0, 1.0], (NUM_STATES, 25)),
         "scans": np.full((3, 360), 5.0),
     }

@@ -140,7 +140,10 @@ def draw(cells: dict[str, dict[str, Any]], strategies: list[str]) -> Figure:
         axis.set_xticks(np.arange(len(cells)), list(cells))
         axis.set_ylabel(f"{rate} rate [1]")
         axis.grid(axis="y", alpha=0.3)
-    figure.axes[0].legend(fontsize=8, ncols=len(strategies), loc="lower center")
+    # Above the plots: inside it would lie over bars, which start at 0.
+    figure.legend(
+        *figure.axes[0].get_legend_handles_labels(), loc="outside upper center", fontsize=8, ncols=len(strategies)
+    )
     return figure
 
 

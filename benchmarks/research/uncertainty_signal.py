@@ -190,7 +190,8 @@ def draw(results: dict[str, Any]) -> Figure:
         axis.set_title(f"{cost} cost", loc="left", fontsize=9)
         axis.set_ylabel("share of the variance [1]")
         axis.tick_params(axis="x", rotation=60, labelsize=7)
-    figure.axes[0].legend(fontsize=8)
+    # Above the plots: the bars fill them.
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", fontsize=8, ncols=3)
     return figure
 
 

@@ -28,6 +28,7 @@ from cura_torchrl.trainers.errors import RunError, RunsFailedError
 from cura_torchrl.trainers.export_config import ExportConfig
 from cura_torchrl.trainers.info import capabilities, git_commit, hardware, shipped_methods, versions
 from cura_torchrl.trainers.methods import PRESETS, method
+from cura_torchrl.trainers.render_config import RenderConfig
 from cura_torchrl.trainers.report_config import ReportConfig
 from cura_torchrl.trainers.table_config import TableConfig
 from cura_torchrl.trainers.train_all_config import PlannedRun, TrainAllConfig
@@ -263,6 +264,15 @@ def _demo(arguments: list[str]) -> None:
     sys.stdout.write(f"{page}\n")
 
 
+def _render(arguments: list[str]) -> None:
+    """Play one scene and write the paper's figures of it and animations."""
+    config = _parse(RenderConfig, "render", arguments)
+    module = _import("cura_torchrl.trainers.render")
+    with _clean_stdout():
+        files = module.render(config)
+    sys.stdout.write("".join(f"{file}\n" for file in files))
+
+
 def _table(arguments: list[str]) -> None:
     """Play methods in all cells and write the table of success rates."""
     config = _parse(TableConfig, "table", arguments)
@@ -383,6 +393,7 @@ _COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "table": _table,
     "report": _report,
     "view": _view,
+    "render": _render,
     "release": _release,
     "export": _export,
     "demo": _demo,

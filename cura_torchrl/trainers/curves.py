@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cura_torchrl.trainers import raster
-from cura_torchrl.trainers.figures import encode_png, tidy
+from cura_torchrl.trainers.scene_axes import encode, tidy
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -241,7 +241,7 @@ def curves_figure(runs: Mapping[str, Rows], columns: Sequence[str]) -> bytes:
     figure.subplots_adjust(0.06, 0.5 / height, 0.985, 1 - 0.6 / height, wspace=0.24, hspace=0.42)
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="upper left", ncols=len(labels), fontsize=9, frameon=False, borderaxespad=0.3)
-    return encode_png(figure)
+    return encode(figure, "png")
 
 
 def _draw(axis: Any, runs: Mapping[str, Rows], column: str) -> None:

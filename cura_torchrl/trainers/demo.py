@@ -18,20 +18,22 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
-from cura_torchrl.trainers import figures, render
+from cura_torchrl.trainers import animation, figures
 from cura_torchrl.trainers.build import load_encoder
 from cura_torchrl.trainers.checkpoint import load_policy, progress_path
 from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError, UnavailableError
+from cura_torchrl.trainers.estimate_figures import distribution_figure
 from cura_torchrl.trainers.evaluate import summarise
 from cura_torchrl.trainers.info import git_commit, hardware, shipped_methods, versions
-from cura_torchrl.trainers.methods import PRESETS
+from cura_torchrl.trainers.methods import PRESETS, policy_labels
 from cura_torchrl.trainers.page import Card, make_page
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.recording import Recording, choose_scenes, record
 from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
 from cura_torchrl.trainers.threads import one_thread
 from cura_torchrl.trainers.train import most_obstacles, train
+from cura_torchrl.trainers.video import encode_animation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -75,7 +77,7 @@ def demo(config: DemoConfig) -> Path:
     scenes = _scenes(config, task)
     config.run_dir.mkdir(parents=True, exist_ok=True)
     with _workers(config.num_workers) as workers:
-        pairs = _play(config, task, scenes, _labels(loaded), workers)
+        pairs = _play(config, task, scenes, policy_labels(loaded), workers)
         telling = most_telling(pairs, config.telling_scenes)
         cards = _draw(config, [*telling, *(pair for pair in pairs if pair not in telling)], workers)
     for line in _summary(pairs):
@@ -131,7 +133,7 @@ def write_pictures(folder: Path, card: Card, task: TaskConfig) -> None:
         "layout.png": figures.layout_figure(task.scenario),
         "paths.png": card.paths,
         "snapshots.png": figures.snapshots_figure(card.recordings),
-        "collision_distribution.png": figures.distribution_figure(card.recordings),
+        "collision_distribution.png": distribution_figure(card.recordings),
         "demo.webp": card.animation,
     }
     for name, content in pictures.items():
@@ -151,13 +153,6 @@ def _load(name: str, config: DemoConfig) -> LoadedPolicy:
     if loaded.config.perception == "map":
         load_encoder(loaded.config.encoder)
     return loaded
-
-
-def _labels(loaded: Sequence[LoadedPolicy]) -> list[str]:
-    labels = [PRESETS[policy.config.method].label for policy in loaded]
-    if len(set(labels)) == len(labels):
-        return labels
-    return [f"{label} ({policy.record['frames']:,} steps)" for label, policy in zip(labels, loaded, strict=True)]
 
 
 def _task(config: DemoConfig, loaded: LoadedPolicy) -> TaskConfig:
@@ -265,11 +260,11 @@ def draw_card(recordings: tuple[Recording, ...], *, every: int, frame_time: floa
     Returns:
         The scene with its pictures.
     """
-    frames = render.animation_frames(recordings, every=every)
+    frames = animation.animation_frames(recordings, every=every)
     return Card(
         recordings=recordings,
         paths=figures.paths_figure(recordings),
-        animation=render.encode_animation(frames, frame_time=every * frame_time),
+        animation=encode_animation(frames, frame_time=every * frame_time),
     )
 
 
@@ -289,7 +284,7 @@ def _summary(pairs: Sequence[_Pair]) -> Iterator[str]:
 def _facts(config: DemoConfig, loaded: Sequence[LoadedPolicy]) -> dict[str, str]:
     machine = hardware()
     facts = {}
-    for label, policy in zip(_labels(loaded), loaded, strict=True):
+    for label, policy in zip(policy_labels(loaded), loaded, strict=True):
         frames, seed, commit = (policy.record[name] for name in ("frames", "seed", "commit"))
         facts[label] = f"{frames:,} environment steps of training, seed {seed}, commit {commit}"
     facts["Scenes"] = f"evaluation stream, seed {config.seed}, up to {config.max_obstacles} obstacles, at least one"

@@ -317,11 +317,11 @@ def _build(config: EvaluateConfig) -> tuple[EnvBase, Callable[[TensorDictBase], 
     """Return the worlds and who plays in them."""
     if config.policy is None:
         loaded = load_policy(_path(config))
-        task = _task(loaded.config.env.task, config)
+        task = evaluation_task(loaded.config.env.task, config)
         env = loaded.make_env(config.chunk, task=task, simulator=config.simulator, seed=config.seed)
         return env, loaded.policy
     base = PushEnvConfig(simulator=config.simulator)
-    env = PushEnv(config.chunk, dataclasses.replace(base, task=_task(base.task, config)), seed=config.seed)
+    env = PushEnv(config.chunk, dataclasses.replace(base, task=evaluation_task(base.task, config)), seed=config.seed)
     if config.policy == "random":
         return env, env.rand_action
     return env, (scripted.ScriptedPusher if config.policy == "scripted" else scripted.ScriptedAvoider)(base.robot)
@@ -344,7 +344,16 @@ def _source(config: EvaluateConfig) -> dict[str, Any]:
     }
 
 
-def _task(task: TaskConfig, config: EvaluateConfig) -> TaskConfig:
+def evaluation_task(task: TaskConfig, config: EvaluateConfig) -> TaskConfig:
+    """Return a task with the scenes that are evaluated.
+
+    Args:
+        task: What the policy was trained on.
+        config: Scenarios.
+
+    Returns:
+        The task.
+    """
     scenario = dataclasses.replace(
         task.scenario, kind=config.scenario, object_edges=(config.object_size,), max_obstacles=config.max_obstacles
     )

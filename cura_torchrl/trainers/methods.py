@@ -5,9 +5,15 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from cura_torchrl.envs.config import MapConfig, PushEnvConfig
 from cura_torchrl.trainers.config import CURAConfig, RiskMeasureKind, TrainConfig, UncertaintyKind
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from cura_torchrl.trainers.checkpoint import LoadedPolicy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,3 +104,18 @@ def method(name: str) -> TrainConfig:
             uncertainty=preset.uncertainty,
         ),
     )
+
+
+def policy_labels(loaded: Sequence[LoadedPolicy]) -> list[str]:
+    """Return what policies are called in figures.
+
+    Args:
+        loaded: The policies.
+
+    Returns:
+        Their methods' names, with the steps of training where two would be the same.
+    """
+    labels = [PRESETS[policy.config.method].label for policy in loaded]
+    if len(set(labels)) == len(labels):
+        return labels
+    return [f"{label} ({policy.record['frames']:,} steps)" for label, policy in zip(labels, loaded, strict=True)]

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
     from cura_torchrl.envs.config import ScenarioConfig
+    from cura_torchrl.envs.simulation.interface import WorldState
 
 _SEARCHED = 512
 """Scenarios of the stream among which scenes are looked for [1]."""
@@ -75,6 +76,12 @@ class Recording:
     """Object (x [m], y [m], yaw [rad]), shape ``[T, 3]``."""
     obstacles: NDArray[np.float32]
     """Obstacles (x [m], y [m], yaw [rad], edge [m]), edge 0 where none has appeared, shape ``[T, 6, 4]``."""
+    arm_joints: NDArray[np.float32]
+    """Joint positions of the arm [rad], shape ``[T, A]``."""
+    object_position: NDArray[np.float32]
+    """Centre of the object's cube [m], shape ``[T, 3]``."""
+    object_quaternion: NDArray[np.float32]
+    """Object's orientation, xyzw, shape ``[T, 4]``."""
     atoms: NDArray[np.float32]
     """The DCE's atoms of the collision possibility C, unsorted [1], shape ``[T, N]``."""
     frame_steps: NDArray[np.int64]
@@ -265,12 +272,13 @@ class Recorder:
         self._lengths = torch.zeros(num_worlds, dtype=torch.int64)
         self._frames: list[list[tuple[int, NDArray[np.float32], NDArray[np.uint8]]]] = [[] for _ in range(num_worlds)]
 
-    def __call__(self, state: TensorDictBase, is_playing: torch.Tensor) -> None:
+    def __call__(self, state: TensorDictBase, is_playing: torch.Tensor, worlds: WorldState) -> None:
         """Keep one state.
 
         Args:
             state: What the environment emitted, with the map and the true obstacles; not changed.
             is_playing: Rows that were being played until then, bool, shape ``[N]``.
+            worlds: Where joints and bodies are.
         """
         predicted = self._estimator(state.select(keys.OBSERVATION, keys.LATENT))
         reach = state[keys.OBSERVATION][..., OBSERVATION_SLICES["tcp_position"]][..., :2]
@@ -280,6 +288,9 @@ class Recorder:
             "tcp": geometry.from_frame(base, reach),
             "object_pose": state[keys.OBJECT_POSE],
             "obstacles": state[keys.OBSTACLES],
+            "arm_joints": worlds.joint_position,
+            "object_position": worlds.object_position,
+            "object_quaternion": worlds.object_quaternion,
             "atoms": predicted[keys.COLLISION_ATOMS],
         }
         for name, value in values.items():
@@ -295,18 +306,18 @@ class Recorder:
         """Return what was watched.
 
         Args:
-            episodes: How it ended, N of them.
-            scenes: What was played, N of them.
+            episodes: How it ended, M of them, at most N.
+            scenes: What was played in the first M worlds.
             label: Who played.
             env: The worlds, with their map.
 
         Returns:
-            N recordings.
+            M recordings.
         """
         task, resolution = env.base_env.config.task, env.transform[0].config.resolution
         tracks = {name: np.stack(values, 1) for name, values in self._tracks.items()}
         result = []
-        for row, (episode, scene, frames) in enumerate(zip(episodes, scenes, self._frames, strict=True)):
+        for row, (episode, scene, frames) in enumerate(zip(episodes, scenes, self._frames[: len(scenes)], strict=True)):
             steps, scans, maps = (np.stack(part) for part in zip(*frames, strict=True))
             result.append(
                 Recording(
@@ -338,8 +349,8 @@ def record(
     """Play scenes side by side and record them.
 
     Args:
-        env: One world a scene; its map stays in the tensordict, and the true obstacles are in it
-            (``TaskConfig.privileged``).
+        env: At least one world a scene; worlds beyond that stand still. Its map stays in the tensordict, and the true
+            obstacles are in it (``TaskConfig.privileged``).
         policy: Writes the action.
         estimator: The DCE.
         scenes: What to play.
@@ -350,10 +361,10 @@ def record(
     Returns:
         One recording a scene.
     """
-    recorder = Recorder(estimator, len(scenes), stride=stride)
+    recorder = Recorder(estimator, env.batch_size[0], stride=stride)
 
     def look(state: TensorDictBase, is_playing: torch.Tensor) -> None:
-        recorder(state, is_playing)
+        recorder(state, is_playing, env.base_env.world_state)
         if watch is not None:
             watch(is_playing)
 

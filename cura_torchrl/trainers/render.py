@@ -1,324 +1,149 @@
-"""Animations of recordings: the scene from above, the map, and what the collision estimator predicts."""
+"""Play one frozen scene with any methods, and write the paper's figures of it and animations."""
 
 from __future__ import annotations
 
-import io
-from dataclasses import dataclass
+import dataclasses
+import logging
+import sys
+from contextlib import closing
 from typing import TYPE_CHECKING
 
-import numpy as np
-from PIL import Image, ImageDraw
+from tqdm import tqdm
 
-from cura_torchrl.envs.robots import ridgeback_franka as model
-from cura_torchrl.envs.sensors.lidar import ray_angles
-from cura_torchrl.trainers import raster
-from cura_torchrl.trainers.raster import SCALE, Axis, Panel, font, rectangle_corners
-from cura_torchrl.trainers.recording import Recording
+from cura_torchrl.trainers.animation import animation_frames, frame_numbers
+from cura_torchrl.trainers.checkpoint import load_policy
+from cura_torchrl.trainers.config import EvaluateConfig
+from cura_torchrl.trainers.estimate_figures import appearance_figure, distribution_figure
+from cura_torchrl.trainers.evaluate import evaluation_task
+from cura_torchrl.trainers.figures import layout_figure, paths_figure, snapshots_figure
+from cura_torchrl.trainers.methods import policy_labels
+from cura_torchrl.trainers.recording import find_scene, record
+from cura_torchrl.trainers.render_config import RenderConfig
+from cura_torchrl.trainers.scene_view import scene_frames
+from cura_torchrl.trainers.threads import one_thread
+from cura_torchrl.trainers.video import encode_animation, require_format
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
-    from numpy.typing import NDArray
+    import torch
+    from PIL import Image
 
-COLUMN_WIDTH, FRAME_HEIGHT = 480, 744
-"""Width of a recording's column and height of a frame [pixel]."""
-_LEFT = 44
-"""Where plot areas begin in a column [pixel]."""
-_FLASH = 1.5
-"""Time for which an obstacle that has just appeared is ringed [s]."""
-_SCENE_X = Axis(-2.5, 16.0, (0, 2, 4, 6, 8, 10, 12, 14), "x [m]")
-_SCENE_Y = Axis(-4.625, 4.625, (-4, -2, 0, 2, 4), "y [m]")
-_OUTCOME_COLOUR = {"success": raster.ROBOT, "collision": raster.FAILURE, "time-out": "#8a6100"}
+    from cura_torchrl.envs.config import TaskConfig
+    from cura_torchrl.trainers.checkpoint import LoadedPolicy
+    from cura_torchrl.trainers.recording import Recording
+    from cura_torchrl.trainers.render_config import FigureName, StillFormat
 
+__all__ = ["RenderConfig", "play_scene", "render"]
 
-@dataclass(frozen=True)
-class _Column:
-    """Panels of one recording, and what they hold in every frame."""
-
-    recording: Recording
-    scene: Panel
-    confidence: Panel
-    occupancy: Panel
-    atoms: Panel
-    risk: Panel
-    uncertainty: Panel
-    curves: tuple[Image.Image, Image.Image]
+logger = logging.getLogger(__name__)
 
 
-def animation_frames(recordings: Sequence[Recording], *, every: int = 1) -> list[Image.Image]:
-    """Return frames that show recordings of the same scene side by side.
-
-    A recording that is over keeps its last state, and the last state is shown in any case.
+def render(config: RenderConfig) -> list[Path]:
+    """Play the scene and write its figures and animations.
 
     Args:
-        recordings: What to show, at least one.
-        every: Every how many of the recordings' scans and maps are shown [1].
+        config: Scene, methods, and what to write.
 
     Returns:
-        Frames of the size (``COLUMN_WIDTH`` times their number, ``FRAME_HEIGHT``) [pixel].
-    """
-    columns, background = _layout(recordings)
-    count = max(len(recording.frame_steps) for recording in recordings)
-    numbers = [*range(0, count - 1, every), count - 1]
-    return [raster.finish(_frame(columns, background, number)) for number in numbers]
+        The files.
+
+    Raises:
+        RunError: If weights are missing or damaged, or a format cannot be written here; before anything is played.
+    """  # noqa: DOC502 - raised by what this calls
+    for kind in config.animation_formats:
+        require_format(kind)
+    loaded = [load_policy(name) for name in config.methods]
+    recordings = play_scene(config, loaded)
+    for recording in recordings:
+        logger.info("scene %d, %s: %s", config.scene, recording.label, recording.describe())
+    config.out.mkdir(parents=True, exist_ok=True)
+    return [*_write_figures(config, recordings, _task(config, loaded[0])), *_write_animations(config, recordings)]
 
 
-def scene_panel(column: int) -> Panel:
-    """Return the panel that shows the scene from above, world frame.
+def play_scene(config: RenderConfig, loaded: Sequence[LoadedPolicy]) -> list[Recording]:
+    """Return the scene as every policy plays it.
 
     Args:
-        column: Index of the recording in the frame [1].
+        config: The scene.
+        loaded: Who plays.
 
     Returns:
-        The panel, which tells where a point of the world is drawn.
+        One recording a policy, with scan and map of every state.
     """
-    return Panel(column * COLUMN_WIDTH + _LEFT, 56, width=420, height=210, x=_SCENE_X, y=_SCENE_Y)
+    recordings = []
+    tasks = [_task(config, policy) for policy in loaded]
+    total = sum(round(task.episode_time / task.policy_period) + 1 for task in tasks)
+    with tqdm(total=total, desc="play", unit="step", file=sys.stderr) as bar:
+
+        def note(_: torch.Tensor) -> None:
+            bar.update()
+
+        for policy, task, label in zip(loaded, tasks, policy_labels(loaded), strict=True):
+            scene = find_scene(task.scenario, seed=config.seed, index=config.scene)
+            env = policy.make_env(config.chunk, task=task, simulator=config.simulator, keep_map=True, seed=config.seed)
+            with one_thread(), closing(env):
+                recordings += record(
+                    env, policy.policy, policy.collision_estimator, [scene], label=label, stride=1, watch=note
+                )
+        bar.update(bar.total - bar.n)
+    return recordings
 
 
-def encode_animation(frames: Sequence[Image.Image], *, frame_time: float, hold_time: float = 2.5) -> bytes:
-    """Return frames as an animated WebP, which loops.
-
-    Args:
-        frames: Frames of one size.
-        frame_time: Time for which a frame is shown [s].
-        hold_time: Time for which the last frame is shown [s].
-
-    Returns:
-        Content of the file.
-    """
-    durations = [round(1000 * frame_time)] * (len(frames) - 1) + [round(1000 * hold_time)]
-    # Flat colours: without loss the file is smaller than with it, and a third of a GIF.
-    options = {"lossless": True, "quality": 40, "method": 2, "loop": 0, "duration": durations}
-    buffer = io.BytesIO()
-    frames[0].save(buffer, "WEBP", save_all=True, append_images=list(frames[1:]), **options)
-    return buffer.getvalue()
-
-
-def map_image(values: NDArray[np.uint8], colours: NDArray[np.uint8], size: int) -> Image.Image:
-    """Return a window of the map as a picture: ahead of the robot is right, its left is up.
-
-    Args:
-        values: One channel of the window [1/255], row along the base's x, column along its y, shape ``[W, W]``.
-        colours: Colour of each value, shape ``[256, 3]``.
-        size: Edge of the picture [pixel].
-
-    Returns:
-        The picture.
-    """
-    turned = np.ascontiguousarray(colours[values.T[::-1]])
-    return Image.fromarray(turned).resize((size, size), Image.Resampling.NEAREST)
-
-
-def _layout(recordings: Sequence[Recording]) -> tuple[list[_Column], Image.Image]:
-    """Return the columns, and a frame with all that does not change."""
-    background = Image.new("RGB", (COLUMN_WIDTH * len(recordings) * SCALE, FRAME_HEIGHT * SCALE), raster.PAPER)
-    last = max(float(recording.times[-1]) for recording in recordings)
-    most_risk = _ceiling(max(float(recording.risk.max()) for recording in recordings), least=0.2)
-    most_uncertainty = _ceiling(max(float(recording.uncertainty.max()) for recording in recordings), least=0.02)
-    columns = []
-    for index, recording in enumerate(recordings):
-        column = _column(recording, index * COLUMN_WIDTH, last, (most_risk, most_uncertainty))
-        columns.append(column)
-        column.scene.decorate(background, "Scene from above, world frame")
-        column.confidence.decorate(background, "Confidence M: light = seen")
-        column.occupancy.decorate(background, "Occupancy O: dark = occupied")
-        column.atoms.decorate(background, "Collision estimate: 50 atoms")
-        column.risk.decorate(background, "Risk R = mean")
-        column.uncertainty.decorate(background, "Uncertainty U = variance")
-        place = (index * COLUMN_WIDTH + _LEFT) * SCALE, 18 * SCALE
-        draw = ImageDraw.Draw(background)
-        draw.text(place, recording.label, fill=raster.INK, font=font(15, bold=True), anchor="ls")
-    _draw_legend(background)
-    return columns, background
-
-
-def _column(recording: Recording, left: int, last: float, most: tuple[float, float]) -> _Column:
-    window = recording.maps.shape[-1] * recording.resolution / 2
-    ahead = Axis(-window, window, (-4, -2, 0, 2, 4), "ahead of the base [m] \N{RIGHTWARDS ARROW} forward")
-    aside = Axis(-window, window, (-4, -2, 0, 2, 4), "left of the base [m]")
-    unlabelled = Axis(-window, window, (-4, -2, 0, 2, 4))
-    seconds = tuple(float(value) for value in range(0, int(last) + 1, 10))
-    time, bare_time = Axis(0.0, last, seconds, "time [s]"), Axis(0.0, last, seconds)
-    num_atoms = recording.atoms.shape[1]
-    number = Axis(0.5, num_atoms + 0.5, (1, num_atoms // 2, num_atoms), "atom, in order of size")
-    chance = Axis(0.0, 1.0, (0.0, 0.25, 0.5, 0.75, 1.0), "C [1]")
-    risk_axis = Axis(0.0, most[0], (0.0, most[0] / 2, most[0]), "R [1]")
-    uncertainty_axis = Axis(0.0, most[1], (0.0, most[1] / 2, most[1]), "U [1]")
-    risk = Panel(left + 264, 567, width=200, height=48, x=bare_time, y=risk_axis)
-    uncertainty = Panel(left + 264, 636, width=200, height=48, x=time, y=uncertainty_axis)
-    return _Column(
-        recording=recording,
-        scene=scene_panel(left // COLUMN_WIDTH),
-        confidence=Panel(left + _LEFT, 320, width=200, height=200, x=ahead, y=aside),
-        occupancy=Panel(left + 264, 320, width=200, height=200, x=ahead, y=unlabelled),
-        atoms=Panel(left + _LEFT, 567, width=150, height=117, x=number, y=chance),
-        risk=risk,
-        uncertainty=uncertainty,
-        curves=(
-            _curve(risk, recording.times, recording.risk, raster.RISK),
-            _curve(uncertainty, recording.times, recording.uncertainty, raster.UNCERTAINTY),
-        ),
+def _task(config: RenderConfig, loaded: LoadedPolicy) -> TaskConfig:
+    settings = EvaluateConfig(
+        checkpoint=loaded.path,
+        scenario=config.scenario,
+        object_size=config.object_size,
+        max_obstacles=config.max_obstacles,
+        seed=config.seed,
+        simulator=config.simulator,
+        chunk=config.chunk,
     )
+    # Pictures show the true obstacles; the policies read only what they did in training.
+    return dataclasses.replace(evaluation_task(loaded.config.env.task, settings), privileged=True)
 
 
-def _ceiling(value: float, *, least: float) -> float:
-    """Return the smallest of 1, 2, 5, 10, ... times ``least`` that is not below ``value``."""
-    top = least
-    for factor in (2.0, 2.5, 2.0) * 4:
-        if top >= value:
-            break
-        top *= factor
-    return top
+def _write_figures(config: RenderConfig, recordings: Sequence[Recording], task: TaskConfig) -> list[Path]:
+    if not config.still_formats:
+        return []
+    written = []
+    for name in tqdm(config.drawn, desc="figures", unit="figure", file=sys.stderr):
+        for kind in config.still_formats:
+            path = config.out / f"{name}.{kind}"
+            path.write_bytes(_draw(name, kind, config, recordings, task))
+            written.append(path)
+    return written
 
 
-def _curve(panel: Panel, times: NDArray[np.floating], values: NDArray[np.floating], colour: str) -> Image.Image:
-    image = panel.blank()
-    points = panel.pixels(np.stack([times, values], -1))
-    ImageDraw.Draw(image).line(points, fill=colour, width=3, joint="curve")
-    return image
+def _draw(
+    name: FigureName, kind: StillFormat, config: RenderConfig, recordings: Sequence[Recording], task: TaskConfig
+) -> bytes:
+    if name == "layout":
+        return layout_figure(task.scenario, kind=kind)
+    if name == "paths":
+        return paths_figure(recordings, kind=kind)
+    if name == "appearance":
+        return appearance_figure(recordings, kind=kind)
+    draw = snapshots_figure if name == "snapshots" else distribution_figure
+    return draw(recordings, times=config.times, kind=kind)
 
 
-def _draw_legend(background: Image.Image) -> None:
-    draw = ImageDraw.Draw(background)
-    x, y = _LEFT * SCALE, (FRAME_HEIGHT - 12) * SCALE
-    entries = (
-        (raster.ROBOT, "robot and its path"),
-        (raster.OBJECT, "object and its path"),
-        (raster.OBSTACLE, "obstacle"),
-        (raster.GOAL, "goal"),
-        (raster.RAY, "seen by the LiDAR"),
-        (raster.HIT, "where a ray ends"),
-    )
-    for colour, text in entries:
-        draw.rectangle([x, y - 5 * SCALE, x + 10 * SCALE, y + 5 * SCALE], fill=colour, outline=raster.FAINT)
-        draw.text((x + 14 * SCALE, y), text, fill=raster.INK, font=font(10), anchor="lm")
-        x += round((26 + font(10).getlength(text) / SCALE) * SCALE)
+def _write_animations(config: RenderConfig, recordings: Sequence[Recording]) -> list[Path]:
+    written = []
+    for view in config.views if config.animation_formats else ():
+        frames = _frames(config, recordings, is_3d=view == "3d")
+        for kind in config.animation_formats:
+            path = config.out / f"animation-{view}.{kind}"
+            path.write_bytes(encode_animation(frames, kind=kind, frame_time=1.0 / config.fps, lossless=view == "top"))
+            written.append(path)
+    return written
 
 
-def _frame(columns: Sequence[_Column], background: Image.Image, number: int) -> Image.Image:
-    frame = background.copy()
-    for column in columns:
-        index = min(number, len(column.recording.frame_steps) - 1)
-        _draw_status(frame, column, index)
-        column.scene.paste(frame, _draw_scene(column, index))
-        column.confidence.paste(frame, _draw_map(column, column.confidence, index, raster.CONFIDENCE_COLOURS))
-        column.occupancy.paste(frame, _draw_map(column, column.occupancy, index, raster.OCCUPANCY_COLOURS))
-        column.atoms.paste(frame, _draw_atoms(column, index))
-        for panel, curve in zip((column.risk, column.uncertainty), column.curves, strict=True):
-            panel.paste(frame, _draw_cursor(panel, curve, float(column.recording.times[_step(column, index)])))
-        _draw_numbers(frame, column, index)
-    return frame
-
-
-def _step(column: _Column, index: int) -> int:
-    return int(column.recording.frame_steps[index])
-
-
-def _draw_status(frame: Image.Image, column: _Column, index: int) -> None:
-    recording, time = column.recording, float(column.recording.times[_step(column, index)])
-    is_known = time >= recording.end_time - 1e-6
-    text = recording.describe() if is_known else f"{time:.1f} s"
-    colour = _OUTCOME_COLOUR[recording.outcome] if is_known else raster.INK
-    right = (column.scene.left + column.scene.width) * SCALE
-    ImageDraw.Draw(frame).text((right, 18 * SCALE), text, fill=colour, font=font(12, bold=is_known), anchor="rs")
-
-
-def _draw_scene(column: _Column, index: int) -> Image.Image:
-    recording, panel, step = column.recording, column.scene, _step(column, index)
-    image = panel.blank()
-    draw = ImageDraw.Draw(image)
-    base, angles = recording.base_pose[step], ray_angles(recording.scans.shape[1]).numpy()
-    bearing = angles + base[2]
-    scan = recording.scans[index]
-    ends = base[:2] + scan[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], -1)
-    points = panel.pixels(ends)
-    draw.polygon(points, fill=raster.RAY)
-    (origin,) = panel.pixels(base[None, :2])
-    for point in points[::8]:
-        draw.line([origin, point], fill="#c3dff0", width=1)
-    _draw_goal(draw, panel, recording)
-    for point, distance in zip(points, scan.tolist(), strict=True):
-        if distance < 0.995 * scan.max():
-            draw.ellipse([point[0] - 2, point[1] - 2, point[0] + 2, point[1] + 2], fill=raster.HIT)
-    _draw_obstacles(draw, panel, recording, step)
-    for path, colour in ((recording.base_pose, raster.ROBOT), (recording.object_pose, raster.OBJECT)):
-        if step > 0:
-            draw.line(panel.pixels(path[: step + 1, :2]), fill=colour, width=4, joint="curve")
-    _draw_bodies(draw, panel, recording, step)
-    return image
-
-
-def _draw_goal(draw: ImageDraw.ImageDraw, panel: Panel, recording: Recording) -> None:
-    edge = recording.scene.object_edge
-    ((x, y),) = panel.pixels(np.array([recording.scene.goal_pose[:2]]))
-    radius = panel.length(recording.success_radius)
-    draw.ellipse([x - radius, y - radius, x + radius, y + radius], outline=raster.GOAL, width=3)
-    draw.polygon(panel.pixels(rectangle_corners(recording.scene.goal_pose, edge, edge)), outline=raster.GOAL, width=3)
-
-
-def _draw_obstacles(draw: ImageDraw.ImageDraw, panel: Panel, recording: Recording, step: int) -> None:
-    now = float(recording.times[step])
-    for obstacle, appeared in zip(recording.obstacles[step], recording.appearances, strict=True):
-        edge = float(obstacle[3])
-        if edge == 0.0:
-            continue
-        draw.polygon(panel.pixels(rectangle_corners(obstacle, edge, edge)), fill=raster.OBSTACLE)
-        if now - appeared <= _FLASH and appeared > 0.0:
-            ((x, y),) = panel.pixels(obstacle[None, :2])
-            radius = panel.length(0.9 * edge + 0.1)
-            draw.ellipse([x - radius, y - radius, x + radius, y + radius], outline=raster.RISK, width=4)
-
-
-def _draw_bodies(draw: ImageDraw.ImageDraw, panel: Panel, recording: Recording, step: int) -> None:
-    edge, base = recording.scene.object_edge, recording.base_pose[step]
-    draw.polygon(panel.pixels(rectangle_corners(recording.object_pose[step], edge, edge)), fill=raster.OBJECT)
-    draw.polygon(panel.pixels(rectangle_corners(base, *model.CHASSIS_SIZE)), fill=raster.ROBOT)
-    arm = panel.pixels(np.stack([base[:2], recording.tcp[step]]))
-    draw.line(arm, fill=raster.ARM, width=6)
-    x, y = arm[1]
-    draw.ellipse([x - 4, y - 4, x + 4, y + 4], fill=raster.ARM)
-
-
-def _draw_map(column: _Column, panel: Panel, index: int, colours: NDArray[np.uint8]) -> Image.Image:
-    recording, step = column.recording, _step(column, index)
-    channel = 0 if panel is column.confidence else -1
-    image = map_image(recording.maps[index, channel], colours, panel.width * SCALE)
-    draw = ImageDraw.Draw(image)
-    edge, pose = recording.scene.object_edge, recording.object_in_base(step)
-    draw.polygon(panel.pixels(rectangle_corners((0.0, 0.0, 0.0), *model.CHASSIS_SIZE)), outline=raster.ROBOT, width=4)
-    draw.polygon(panel.pixels(rectangle_corners(pose, edge, edge)), outline=raster.OBJECT, width=4)
-    return image
-
-
-def _draw_atoms(column: _Column, index: int) -> Image.Image:
-    recording, panel, step = column.recording, column.atoms, _step(column, index)
-    image = panel.blank()
-    draw = ImageDraw.Draw(image)
-    for number, atom in enumerate(np.sort(recording.atoms[step]).clip(0.0, 1.0).tolist(), start=1):
-        (x0, y0), (x1, y1) = panel.pixels(np.array([[number - 0.4, atom], [number + 0.4, 0.0]]))
-        draw.rectangle([x0, y0, x1, y1], fill=raster.UNCERTAINTY)
-    risk = float(recording.risk[step])
-    mean = panel.pixels(np.array([[panel.x.low, risk], [panel.x.high, risk]]))
-    draw.line(mean, fill=raster.RISK, width=3)
-    return image
-
-
-def _draw_numbers(frame: Image.Image, column: _Column, index: int) -> None:
-    step, draw = _step(column, index), ImageDraw.Draw(frame)
-    for panel, text, colour in (
-        (column.risk, raster.two_digits(column.recording.risk[step]), raster.RISK),
-        (column.uncertainty, f"{column.recording.uncertainty[step]:.3f}", raster.UNCERTAINTY),
-    ):
-        place = (panel.left + panel.width) * SCALE, (panel.top - 4) * SCALE
-        draw.text(place, text, fill=colour, font=font(11, bold=True), anchor="rs")
-
-
-def _draw_cursor(panel: Panel, curve: Image.Image, time: float) -> Image.Image:
-    """Return the curve up to now; what is to come is pale."""
-    image = curve.copy()
-    ((column, _),) = panel.pixels(np.array([[time, panel.y.high]]))
-    left = min(round(column), image.width - 2)
-    rest = image.crop((left, 0, image.width, image.height))
-    image.paste(Image.blend(rest, Image.new("RGB", rest.size, raster.PAPER), 0.75), (left, 0))
-    ImageDraw.Draw(image).line([(left, 0), (left, image.height)], fill=raster.INK, width=2)
-    return image
+def _frames(config: RenderConfig, recordings: Sequence[Recording], *, is_3d: bool) -> list[Image.Image]:
+    if not is_3d:
+        return animation_frames(recordings, every=config.every)
+    count = len(frame_numbers(recordings, config.every))
+    frames = scene_frames(recordings, size=config.size, every=config.every)
+    return list(tqdm(frames, total=count, desc="3-D view", unit="frame", file=sys.stderr))

@@ -15,6 +15,7 @@ from cura_torchrl.trainers.build import load_encoder
 from cura_torchrl.trainers.checkpoint import LoadedPolicy, load_policy, progress_path
 from cura_torchrl.trainers.demo import draw_card
 from cura_torchrl.trainers.errors import RunError
+from cura_torchrl.trainers.estimate_figures import distribution_figure
 from cura_torchrl.trainers.folder_section import read_folder
 from cura_torchrl.trainers.markup import document
 from cura_torchrl.trainers.progress import read_progress
@@ -80,9 +81,7 @@ def report(config: ReportConfig) -> Path:
         report_page.run_section(first.source, first.loaded, first.rows, others),
         report_page.curves_section(curves, has_own=bool(first.rows)),
         report_page.table_section(table, first.loaded),
-        report_page.scene_section(
-            card, figures.snapshots_figure(recordings), figures.distribution_figure(recordings), config
-        ),
+        report_page.scene_section(card, figures.snapshots_figure(recordings), distribution_figure(recordings), config),
         report_page.calibration_section(calibration),
         report_page.configuration_section(first.loaded.config),
     ]

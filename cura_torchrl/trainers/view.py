@@ -16,11 +16,11 @@ import torch
 from cura_torchrl.envs.robots import ridgeback_franka as model
 from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.trainers import raster
+from cura_torchrl.trainers.animation import map_image
 from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.errors import UnavailableError
 from cura_torchrl.trainers.evaluate import play_episodes
 from cura_torchrl.trainers.recording import Recorder, Recording, find_scene, record
-from cura_torchrl.trainers.render import map_image
 from cura_torchrl.trainers.threads import one_thread
 from cura_torchrl.trainers.view_config import ViewConfig
 
@@ -208,7 +208,7 @@ def _show_live(loaded: LoadedPolicy, env: EnvBase, scene: Scene, shown: View) ->
 
     def look(state: TensorDictBase, is_playing: torch.Tensor) -> None:
         recorder = Recorder(loaded.collision_estimator, 1, stride=1)
-        recorder(state, is_playing)
+        recorder(state, is_playing, env.base_env.world_state)
         (recording,) = recorder.recordings([None], [scene], label="", env=env)  # type: ignore[list-item]
         shown.show(recording, 0, passed=next(states) * recording.period)
         shown.wait(recording.period, scene.index)

@@ -20,6 +20,7 @@ from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.export_config import ExportConfig
 from cura_torchrl.trainers.methods import PRESETS, method
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
+from cura_torchrl.trainers.render_config import RenderConfig
 from cura_torchrl.trainers.report_config import ReportConfig
 from cura_torchrl.trainers.run_folder import is_locked
 from cura_torchrl.trainers.run_status import read_record
@@ -62,7 +63,7 @@ def test_help_lists_every_command_and_method() -> None:
     done = run("--help")
     assert done.returncode == 0
     learning = ("pretrain-map", "imitate", "train", "train-all")
-    others = ("evaluate", "table", "report", "view", "release", "export", "demo", "bench", "info")
+    others = ("evaluate", "table", "render", "report", "view", "release", "export", "demo", "bench", "info")
     for name in (*learning, *others, *PRESETS):
         assert name in done.stdout
 
@@ -76,6 +77,7 @@ def test_help_lists_every_command_and_method() -> None:
         ("table", TableConfig),
         ("report", ReportConfig),
         ("view", ViewConfig),
+        ("render", RenderConfig),
         ("demo", DemoConfig),
         ("export", ExportConfig),
         ("bench", BenchConfig),
@@ -139,6 +141,12 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
         (["report", "push", "--curves", "{tmp}/none.csv"], "no rows of progress in"),
         (["report", "push", "--out", "{tmp}"], "a folder; accepted: a file to write"),
         (["report", "push", "--object-size", "3"], "object_size is 3.0; accepted: 0.3 to 1.2 m"),
+        (["render", "--methods", "push,cura"], "method is 'cura'; accepted: cura-no-risk, "),
+        (["render", "--methods", "{tmp}"], "no checkpoint at"),
+        (["render", "--scene", "-1"], "scene is -1; accepted: 0 to 2147483647"),
+        (["render", "--formats", "png,jpg"], "format is 'jpg'; accepted: png, svg, mp4, gif, webp"),
+        (["render", "--figures", "path"], "figure is 'path'; accepted: all, none, paths, snapshots, "),
+        (["render", "--times", "3", "1"], "times is (3.0, 1.0); accepted: at most 6 growing times [s]"),
         (["bench"], "env,learner,lidar,ik,peers"),
         (["bench", "speed"], "speed"),
         (["bench", "env", "--rounds", "0"], "rounds is 0; accepted: 1 or more"),

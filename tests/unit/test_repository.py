@@ -188,7 +188,7 @@ def _normalise(name: str) -> str:
 def test_every_third_party_import_is_a_declared_dependency() -> None:
     """Catches a module that works only because another package happens to bring its import along."""
     distributions = importlib.metadata.packages_distributions()
-    declared = _requirements("tensorboard", "wandb", "ray", "peers", "export", "gym")
+    declared = _requirements("tensorboard", "wandb", "ray", "peers", "export", "gym", "video", "table", "live")
     undeclared = set()
     for path in MODULES:
         for module in _imports(_tree(path)) - set(sys.stdlib_module_names) - {"cura_torchrl"}:

@@ -57,7 +57,7 @@ class BulletWorlds:
         self.num_worlds = num_worlds
         self._urdf, self._joints, self._physics = str(urdf), joints, physics
         self._index = list(range(len(joints)))
-        with _silent():
+        with silent():
             self._clients = [bullet.connect(bullet.DIRECT) for _ in range(num_worlds)]
         if min(self._clients) < 0:
             self.close()
@@ -85,7 +85,7 @@ class BulletWorlds:
             rows: Indices of the worlds, shape ``[B]``.
             scene: Where everything starts, batch ``[B]``.
         """
-        with _silent():
+        with silent():
             for row, world in enumerate(rows.tolist()):
                 self._build(world, scene, row)
 
@@ -313,7 +313,7 @@ def _rotate(quaternion: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
 
 
 @contextlib.contextmanager
-def _silent() -> Iterator[None]:
+def silent() -> Iterator[None]:
     """Send C's stdout to nowhere: Bullet prints there and cannot be told not to."""
     sys.stdout.flush()
     saved = os.dup(1)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 
 import numpy as np
-import pytest
 from PIL import Image, ImageColor
 
 from cura_torchrl.envs.config import ScenarioConfig
 from cura_torchrl.trainers import figures, raster
-from tests.recordings import NUM_STATES, make_episode, make_recording
+from cura_torchrl.trainers.estimate_figures import distribution_figure
+from tests.recordings import make_recording
 
 
 def pixels(content: bytes) -> np.ndarray:
@@ -53,7 +52,7 @@ def test_snapshots_and_distributions_are_pictures() -> None:
     )
     assert 0.8 < light / dark < 1.2
     assert 1.6 < free / light < 2.4
-    bars = pixels(figures.distribution_figure(pair))
+    bars = pixels(distribution_figure(pair))
     # Half of the atoms are 0 and half are 1: two bars in each of six plots, and the mean between them.
     assert count(bars, raster.UNCERTAINTY) > 1000
     assert count(bars, raster.RISK) > 500
@@ -78,34 +77,3 @@ def test_curves_are_drawn_with_and_without_a_history() -> None:
     without, with_ = pixels(figures.curve_figure([], after)), pixels(figures.curve_figure(before, after))
     assert count(with_, raster.ROBOT) > count(without, raster.ROBOT) + 200
     assert count(without, raster.UNCERTAINTY) > 50
-
-
-def test_telling_frames_are_appearance_peak_and_end() -> None:
-    """Catches moments by index and not by time: frames are 0.6 s apart here, the obstacle appears after 2.4 s."""
-    num_states = 61
-    atoms = np.zeros((num_states, 2), dtype=np.float32)
-    atoms[33, 1] = 1.0  # the highest uncertainty, 6.6 s: frame 11
-    obstacles = np.zeros((num_states, 6, 4), dtype=np.float32)
-    obstacles[12:, 0, 3] = 0.4
-    still = np.zeros((num_states, 3), dtype=np.float32)
-    recording = make_recording(
-        base_pose=still,
-        object_pose=still,
-        tcp=still[:, :2],
-        atoms=atoms,
-        obstacles=obstacles,
-        frame_steps=np.arange(0, num_states, 3),
-        episode=make_episode(steps=57),
-    )
-    # 57 steps of 0.2 s are 11.4 s: frame 19. The appearance, state 12, is frame 4.
-    assert figures.telling_frames(recording) == [4, 11, 19]
-    # An episode that ends after 3.6 s, in frame 6, has no room for the peak: the moment in the middle is shown.
-    assert figures.telling_frames(dataclasses.replace(recording, episode=make_episode(steps=18))) == [4, 5, 6]
-
-
-@pytest.mark.parametrize("outcome", ["success", "collision", "time-out"])
-def test_telling_frames_exist_however_short_the_episode_is(outcome: str) -> None:
-    """Catches an index beyond a recording of three frames."""
-    moments = figures.telling_frames(make_recording(outcome=outcome))
-    assert moments == sorted(moments)
-    assert 0 <= moments[0] <= moments[-1] <= NUM_STATES // 3

@@ -12,11 +12,12 @@ from tensordict import TensorDict
 
 from cura_torchrl.envs.config import MapConfig, PushEnvConfig, ScenarioConfig, TaskConfig
 from cura_torchrl.envs.push import PushEnv
-from cura_torchrl.envs.robots.ridgeback_franka import HOME_TCP
+from cura_torchrl.envs.robots.ridgeback_franka import HOME, HOME_TCP
 from cura_torchrl.envs.robots.scripted import ScriptedPusher
+from cura_torchrl.envs.simulation.interface import WorldState
 from cura_torchrl.trainers.build import Networks, make_env
 from cura_torchrl.trainers.methods import method
-from cura_torchrl.trainers.recording import Recorder, Recording, choose_scenes, record
+from cura_torchrl.trainers.recording import Recorder, Recording, choose_scenes, find_scene, record
 from tests.recordings import make_episode, make_recording
 
 SCENARIO = ScenarioConfig(max_obstacles=2)
@@ -102,6 +103,12 @@ def test_scenes_are_half_of_each_kind_with_sizes_in_turn_and_obstacles() -> None
         env.close()
 
 
+def test_one_scene_is_that_of_its_index() -> None:
+    """Catches another stream, seed or index than that which evaluate plays."""
+    chosen = choose_scenes(SCENARIO, seed=3, count=1)[0]
+    assert find_scene(SCENARIO, seed=3, index=chosen.index) == chosen
+
+
 def test_more_scenes_than_there_are_are_refused() -> None:
     """Catches a silent shortage: the summary would then be of fewer scenes than asked for."""
     with pytest.raises(ValueError, match="number of scenes is 200; accepted"):
@@ -128,15 +135,31 @@ def state(step: int, *, done: tuple[bool, bool] = (False, False)) -> TensorDict:
     )
 
 
+def worlds(step: int) -> WorldState:
+    """Where the two worlds' bodies are: joints and heights grow with every step."""
+    two = torch.ones(2, 1, dtype=torch.float64)
+    return WorldState(
+        base_pose=torch.zeros(2, 3),
+        base_velocity=torch.zeros(2, 3),
+        joint_position=step * two.expand(2, 7),
+        joint_velocity=torch.zeros(2, 7),
+        object_position=10 * step * two.expand(2, 3),
+        object_quaternion=torch.tensor([[0.0, 0.0, 0.0, 1.0]] * 2),
+        object_velocity=torch.zeros(2, 3),
+        object_angular_velocity=torch.zeros(2, 3),
+        contact=torch.zeros(2, 3, dtype=torch.bool),
+    )
+
+
 def test_a_recording_ends_with_its_episode_and_keeps_its_last_frame() -> None:
     """Catches rows that go on while others play, and a last state without picture."""
     recorder = Recorder(lambda td: td.set("collision_atoms", td["observation"][:, :2]), 2, stride=3)
     over = torch.tensor([True, False])
-    recorder(state(0), torch.tensor([True, True]))
-    recorder(state(1), torch.tensor([True, True]))
-    recorder(state(2, done=(False, True)), torch.tensor([True, True]))
+    recorder(state(0), torch.tensor([True, True]), worlds(0))
+    recorder(state(1), torch.tensor([True, True]), worlds(1))
+    recorder(state(2, done=(False, True)), torch.tensor([True, True]), worlds(2))
     for step in (3, 4):
-        recorder(state(step, done=(step == 4, False)), over)
+        recorder(state(step, done=(step == 4, False)), over, worlds(step))
     env = make_env(method("push").replace(perception="none"), 1, keep_map=True)
     try:
         first, second = recorder.recordings(
@@ -149,6 +172,8 @@ def test_a_recording_ends_with_its_episode_and_keeps_its_last_frame() -> None:
     assert len(first.base_pose) == len(first.atoms) == 5
     assert len(second.base_pose) == len(second.atoms) == 3
     assert second.scans[:, 0].tolist() == [1.0, 3.0]
+    assert first.arm_joints[:, 6].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert second.object_position[:, 2].tolist() == [0.0, 10.0, 20.0]
     assert second.tcp.tolist() == pytest.approx(np.array([[0.9, 10.0], [1.0, 10.0], [1.1, 10.0]]))
     assert (first.maps == 128).all()
 
@@ -181,6 +206,11 @@ def test_recording_holds_what_the_environment_played() -> None:
         assert one.atoms.shape == (6, 50)
         assert one.episode.index == one.scene.index
         assert one.period == 0.2
+        assert one.arm_joints[0] == pytest.approx(HOME, abs=1e-5)
+        # The cube stands on the floor, where the planar pose says.
+        assert one.object_position[:, 2] == pytest.approx(np.full(6, one.scene.object_edge / 2), abs=0.01)
+        assert one.object_position[:, :2].tolist() == one.object_pose[:, :2].tolist()
+        assert np.linalg.norm(one.object_quaternion, axis=1) == pytest.approx(np.ones(6), abs=1e-5)
         reach = np.linalg.norm(one.tcp[0] - one.base_pose[0, :2])
         assert reach == pytest.approx(HOME_TCP[0], abs=5e-3)
         # The start has the object at x = 0 and the goal 12 to 14 m ahead.

@@ -1,137 +1,82 @@
-"""Animations show the recording: every body at its place, at its time."""
+"""The figures' command: every file that was asked for, of the scene that evaluate plays."""
 
 from __future__ import annotations
 
+import dataclasses
 import io
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree
 
-import numpy as np
 import pytest
-from PIL import Image, ImageColor
+from PIL import Image
 
-from cura_torchrl.trainers import raster, render
-from cura_torchrl.trainers.render import (
-    COLUMN_WIDTH,
-    FRAME_HEIGHT,
-    animation_frames,
-    encode_animation,
-    map_image,
-    scene_panel,
-)
+from cura_torchrl.trainers import render as render_module
+from cura_torchrl.trainers.checkpoint import load_policy
+from cura_torchrl.trainers.config import EvaluateConfig
+from cura_torchrl.trainers.errors import UnavailableError
+from cura_torchrl.trainers.evaluate import evaluate, outcome_letter
+from cura_torchrl.trainers.render import play_scene, render
+from cura_torchrl.trainers.render_config import FIGURES, RenderConfig
 from tests.recordings import make_recording
 
+if TYPE_CHECKING:
+    from pathlib import Path
 
-@pytest.fixture(scope="module")
-def frames() -> list[Image.Image]:
-    """The same drive twice; the one on the left ends half way."""
-    long = make_recording()
-    short = make_recording(
-        outcome="collision",
-        frame_steps=long.frame_steps[:2],
-        scans=long.scans[:2],
-        maps=long.maps[:2],
-        **{name: getattr(long, name)[:4] for name in ("base_pose", "tcp", "object_pose", "obstacles", "atoms")},
-    )
-    return animation_frames([short, long])
+SCENE, CHUNK = 3, 5
 
 
-def colour_at(frame: Image.Image, x: float, y: float, *, column: int = 1) -> tuple[int, ...]:
-    """Return the colour of a place in the world, as a recording's scene panel shows it."""
-    left, top = scene_panel(column).pixel_in_frame(x, y)
-    return frame.getpixel((int(left), int(top)))
+def test_the_scene_is_played_as_evaluate_plays_it() -> None:
+    """Catches another scene, task or batch: evaluate plays scenes 0 to 4 side by side, here 3 is played alone."""
+    scenes = {"scenario": "adversarial", "object_size": 1.0, "simulator": "planar", "chunk": CHUNK}
+    known = evaluate(EvaluateConfig(method="push", episodes=CHUNK, **scenes))
+    config = RenderConfig(methods=("push",), scene=SCENE, **scenes)
+    (recording,) = play_scene(config, [load_policy("push")])
+    assert outcome_letter(recording.episode) == known["outcomes"][SCENE]
+    assert recording.scene.kind == "adversarial"
+    assert recording.scene.object_edge == 1.0
+    assert len(recording.frame_steps) == len(recording.base_pose) == len(recording.arm_joints)
 
 
-def test_frames_have_one_column_for_each_recording(frames: list[Image.Image]) -> None:
-    """Catches a frame that is cut off, and an animation that ends with the shorter recording."""
-    assert len(frames) == 3
-    assert {frame.size for frame in frames} == {(2 * COLUMN_WIDTH, FRAME_HEIGHT)}
+@pytest.fixture
+def played(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is simulated: the methods have played what is known."""
+    recordings = [make_recording(outcome="collision"), make_recording()]
+    monkeypatch.setattr(render_module, "play_scene", lambda config, loaded: recordings[: len(loaded)])
 
 
-@pytest.mark.parametrize(("number", "x"), [(0, 0.0), (1, 1.5), (2, 3.0)])
-def test_bodies_have_their_colours_at_their_places(frames: list[Image.Image], number: int, x: float) -> None:
-    """Catches a wrong frame, scale or axis: frames are states 0, 3, 6, the base moves 0.5 m between states."""
-    assert colour_at(frames[number], x + 1.7, 0.3) == ImageColor.getrgb(raster.OBJECT)
-    assert colour_at(frames[number], x - 0.3, 0.25) == ImageColor.getrgb(raster.ROBOT)
+@pytest.mark.usefixtures("played")
+def test_every_figure_and_view_is_written(tmp_path: Path) -> None:
+    """Catches a figure, format or view that is left out, and files that no reader can open."""
+    config = RenderConfig(formats=("png,svg", "gif"), view="both", size=(480, 240), every=2, out=tmp_path / "new")
+    files = render(config)
+    stills = {f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")}
+    assert {file.name for file in files} == {*stills, "animation-top.gif", "animation-3d.gif"}
+    assert set(files) == set((tmp_path / "new").iterdir())
+    for file in files:
+        if file.suffix == ".svg":
+            root = ElementTree.fromstring(file.read_text(encoding="utf-8"))
+            assert root.tag == "{http://www.w3.org/2000/svg}svg"
+            continue
+        with Image.open(io.BytesIO(file.read_bytes())) as picture:
+            picture.load()
+            # Frames 0 and 2 of three.
+            assert getattr(picture, "n_frames", 1) == (2 if file.suffix == ".gif" else 1)
 
 
-def test_obstacle_is_drawn_once_it_has_appeared(frames: list[Image.Image]) -> None:
-    """Catches pictures that show what is not there yet: it appears in state 2, between the first two frames."""
-    assert colour_at(frames[0], 8.0, 0.0) != ImageColor.getrgb(raster.OBSTACLE)
-    assert colour_at(frames[1], 8.0, 0.1) == ImageColor.getrgb(raster.OBSTACLE)
+@pytest.mark.usefixtures("played")
+def test_what_is_not_asked_for_is_not_drawn(tmp_path: Path) -> None:
+    """Catches minutes of drawing for one figure."""
+    config = RenderConfig(methods=("push",), figures=("paths",), formats=("svg",), times=(0.2,), out=tmp_path)
+    assert [file.name for file in render(config)] == ["paths.svg"]
+    none = dataclasses.replace(config, figures=("none",), formats=("webp",), every=9)
+    assert [file.name for file in render(none)] == ["animation-top.webp"]
 
 
-def test_paths_are_drawn_behind_the_bodies(frames: list[Image.Image]) -> None:
-    """Catches a path that is missing: the base came from x = 0 to x = 3."""
-    assert colour_at(frames[2], 1.0, 0.0) == ImageColor.getrgb(raster.ROBOT)
-    assert colour_at(frames[2], 1.0, 0.5) != ImageColor.getrgb(raster.ROBOT)
-
-
-def test_lidar_sees_as_far_as_it_measured(frames: list[Image.Image]) -> None:
-    """Catches rays of the wrong length: 5 m around the base."""
-    assert colour_at(frames[0], 3.0, 3.0) in {ImageColor.getrgb(raster.RAY), ImageColor.getrgb("#c3dff0")}
-    assert colour_at(frames[0], 5.5, 3.0) == (255, 255, 255)
-
-
-def test_a_recording_that_is_over_stands_still(frames: list[Image.Image]) -> None:
-    """Catches an animation that runs past a recording's end, or wraps around."""
-    left = [np.asarray(frame)[:, :COLUMN_WIDTH] for frame in frames]
-    assert np.array_equal(left[1], left[2])
-    assert not np.array_equal(left[0], left[1])
-
-
-def test_every_second_frame_still_shows_the_end(frames: list[Image.Image]) -> None:
-    """Catches a thinned animation that leaves the outcome out."""
-    recording = make_recording()
-    thin = animation_frames([recording], every=5)
-    assert len(thin) == 2
-    assert np.array_equal(np.asarray(thin[-1]), np.asarray(animation_frames([recording])[-1]))
-
-
-def test_map_shows_what_is_ahead_on_the_right_and_the_left_on_top() -> None:
-    """Catches a mirrored or turned map: row i lies ahead, column j to the left."""
-    values = np.zeros((100, 100), dtype=np.uint8)
-    values[99, 0] = 255  # far ahead, far to the right
-    picture = np.asarray(map_image(values, raster.CONFIDENCE_COLOURS, 200))
-    light, dark = raster.CONFIDENCE_COLOURS[255], raster.CONFIDENCE_COLOURS[0]
-    assert (picture[-2:, -2:] == light).all()
-    assert (picture[:2, -2:] == dark).all()
-    assert (picture[:, :2] == dark).all()
-
-
-def test_map_panel_shows_the_recorded_confidence(frames: list[Image.Image]) -> None:
-    """Catches swapped channels: what is ahead has been seen, nothing is occupied."""
-    pixels = np.asarray(frames[0])[:, COLUMN_WIDTH:]
-    # The panels' plot areas are 200 pixels wide, at 44 (confidence) and 264 (occupancy), 320 from the top.
-    assert (pixels[330, 230] == raster.CONFIDENCE_COLOURS[255]).all()
-    assert (pixels[330, 60] == raster.CONFIDENCE_COLOURS[0]).all()
-    assert (pixels[330, 450] == raster.OCCUPANCY_COLOURS[0]).all()
-
-
-def test_atoms_are_drawn_as_bars_in_order_of_size(frames: list[Image.Image]) -> None:
-    """Catches unsorted atoms: half of them are 0 and half are 1, so the bars fill the right half."""
-    pixels = np.asarray(frames[0])[567:684, COLUMN_WIDTH + 44 : COLUMN_WIDTH + 194]
-    is_bar = (np.abs(pixels[20].astype(int) - ImageColor.getrgb(raster.UNCERTAINTY)) < 60).all(-1)
-    assert is_bar[:74].sum() == 0
-    assert is_bar[76:].mean() > 0.5
-
-
-def test_animation_is_whole_and_keeps_its_last_frame_longer(frames: list[Image.Image]) -> None:
-    """Catches frames that are dropped or altered, and an animation that does not loop."""
-    content = encode_animation(frames, frame_time=0.1, hold_time=2.0)
-    with Image.open(io.BytesIO(content)) as animation:
-        assert (animation.format, animation.n_frames, animation.info["loop"]) == ("WEBP", 3, 0)
-        shown = []
-        for number in range(3):
-            animation.seek(number)
-            shown.append((animation.convert("RGB"), animation.info["duration"]))
-    assert [duration for _, duration in shown] == [100, 100, 2000]
-    assert all(np.array_equal(np.asarray(a), np.asarray(b)) for (a, _), b in zip(shown, frames, strict=True))
-
-
-def test_scales_of_both_columns_are_the_same() -> None:
-    """Catches a baseline whose uncertainty looks small because its axis is long."""
-    calm = make_recording(atoms=np.full((7, 50), 0.01, dtype=np.float32))
-    left = np.asarray(animation_frames([calm, make_recording()])[0])[567:684, 264:464]
-    alone = np.asarray(animation_frames([calm])[0])[567:684, 264:464]
-    # R = 0.01 of an axis that ends at 0.2 when alone, at 0.5 beside R = 0.5: the lines differ.
-    assert not np.array_equal(left, alone)
-    assert render._ceiling(0.5, least=0.2) == pytest.approx(1.0)
+def test_a_format_that_cannot_be_written_is_refused_before_anything_is_played(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Catches a scene that is played for minutes and then lost."""
+    monkeypatch.setattr("cura_torchrl.trainers.video.importlib.util.find_spec", lambda _: None)
+    monkeypatch.setattr(render_module, "play_scene", lambda *_: pytest.fail("played"))
+    with pytest.raises(UnavailableError, match="format is mp4"):
+        render(RenderConfig(formats=("mp4",), out=tmp_path))
