@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from cura_torchrl.trainers.bench_config import BenchConfig
+from cura_torchrl.trainers.calibration_config import CalibrateConfig
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError
@@ -211,6 +212,15 @@ def _table(arguments: list[str]) -> None:
     sys.stdout.write(page)
 
 
+def _calibrate(arguments: list[str]) -> None:
+    """Compare what the collision estimator predicts with what comes of it."""
+    config = _parse(CalibrateConfig, "calibrate", arguments)
+    module = _import("cura_torchrl.trainers.calibrate")
+    with _clean_stdout():
+        page = module.calibrate(config)
+    sys.stdout.write(page)
+
+
 def _defaults(arguments: list[str]) -> TrainConfig:
     """Return what the flags of ``train`` start from: the method's preset, or the run's own configuration."""
     scout = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -302,6 +312,7 @@ _COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "train": _train,
     "evaluate": _evaluate,
     "table": _table,
+    "calibrate": _calibrate,
     "release": _release,
     "demo": _demo,
     "bench": _bench,

@@ -58,7 +58,7 @@ def paths_figure(recordings: Sequence[Recording]) -> bytes:
         axis.set_title(f"{recording.label}: {recording.describe()}", fontsize=10, loc="left")
     axes[0].set_ylabel("y [m]")
     _set_margins(figure)
-    return _png(figure)
+    return as_png(figure)
 
 
 def snapshots_figure(recordings: Sequence[Recording]) -> bytes:
@@ -86,7 +86,7 @@ def snapshots_figure(recordings: Sequence[Recording]) -> bytes:
         for row, channel in ((1, 0), (2, -1)):
             axes = [figure.add_subplot(grid[row, column]) for column in range(3)]
             _draw_maps(axes, recording, frames, channel=channel)
-    return _png(figure)
+    return as_png(figure)
 
 
 def distribution_figure(recordings: Sequence[Recording]) -> bytes:
@@ -116,7 +116,7 @@ def distribution_figure(recordings: Sequence[Recording]) -> bytes:
     for axis in axes[-1]:
         axis.set_xlabel("collision possibility C [1]")
     _set_margins(figure, left=0.85)
-    return _png(figure)
+    return as_png(figure)
 
 
 def layout_figure(config: ScenarioConfig) -> bytes:
@@ -146,7 +146,7 @@ def layout_figure(config: ScenarioConfig) -> bytes:
     _frame_world(axis)
     axis.set_ylabel("y [m]")
     _set_margins(figure, top=0.15)
-    return _png(figure)
+    return as_png(figure)
 
 
 def _draw_sizes(axis: Any, config: ScenarioConfig) -> None:
@@ -193,7 +193,7 @@ def curve_figure(before: Sequence[dict[str, float]], after: Sequence[dict[str, f
         pair[0].set_xlabel("environment steps [million]")
         pair[1].set_xlabel("steps [thousand]")
     _set_margins(figure)
-    return _png(figure)
+    return as_png(figure)
 
 
 def telling_frames(recording: Recording) -> list[int]:
@@ -306,7 +306,15 @@ def _set_margins(figure: Figure, *, left: float = 0.6, right: float = 0.15, top:
     figure.subplots_adjust(left / width, 0.55 / height, 1 - right / width, 1 - top / height)
 
 
-def _png(figure: Figure) -> bytes:
+def as_png(figure: Figure) -> bytes:
+    """Return a figure as a small PNG file.
+
+    Args:
+        figure: What to draw.
+
+    Returns:
+        Content of the file.
+    """
     # A palette of 256 colours makes a third of the size.
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=_DOTS, facecolor="white")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from cura_torchrl.trainers.bench_config import BenchConfig
+from cura_torchrl.trainers.calibration_config import CalibrateConfig
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
@@ -55,7 +56,19 @@ def test_help_lists_every_command_and_method() -> None:
     """Catches a command that nobody finds."""
     done = run("--help")
     assert done.returncode == 0
-    for name in ("pretrain-map", "imitate", "train", "evaluate", "table", "release", "demo", "bench", "info", *METHODS):
+    for name in (
+        "pretrain-map",
+        "imitate",
+        "train",
+        "evaluate",
+        "table",
+        "calibrate",
+        "release",
+        "demo",
+        "bench",
+        "info",
+        *METHODS,
+    ):
         assert name in done.stdout
 
 
@@ -65,6 +78,7 @@ def test_help_lists_every_command_and_method() -> None:
         ("train", TrainConfig),
         ("evaluate", EvaluateConfig),
         ("table", TableConfig),
+        ("calibrate", CalibrateConfig),
         ("demo", DemoConfig),
         ("bench", BenchConfig),
     ],
@@ -110,6 +124,9 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
         (["table", "--methods", "push,cura"], "method is 'cura'; accepted: cura-no-risk, "),
         (["table", "--cells", "uniform-0.5", "uniform-9"], "cell is 'uniform-9'; accepted: all, or SCENARIO-SIZE"),
         (["table", "--methods", "push", "--seeds", "7", "--runs", "{tmp}", "--out", "{tmp}"], "no checkpoint at"),
+        (["calibrate", "--methods", "cura-pp"], "method is 'cura-pp'; accepted: cura-no-risk, "),
+        (["calibrate", "--conditions", "night"], "condition is 'night'; accepted: on-policy, big-object, "),
+        (["calibrate", "--repeats", "3"], "repeats is 3; accepted: a divisor of 256 futures"),
         (["bench"], "env,learner,lidar,ik,peers"),
         (["bench", "speed"], "speed"),
         (["bench", "env", "--rounds", "0"], "rounds is 0; accepted: 1 or more"),
