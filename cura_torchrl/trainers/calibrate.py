@@ -20,6 +20,7 @@ from cura_torchrl.trainers.calibration_config import CONDITIONS, CalibrateConfig
 from cura_torchrl.trainers.calibration_figures import coverage_figure, reliability_figure, truth_figure
 from cura_torchrl.trainers.calibration_report import as_markdown
 from cura_torchrl.trainers.checkpoint import load_policy
+from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.evaluate import play_episodes
 from cura_torchrl.trainers.futures import against_truth, horizon, summarise
 from cura_torchrl.trainers.info import provenance
@@ -45,19 +46,25 @@ def calibrate(config: CalibrateConfig) -> str:
 
     Args:
         config: Methods, conditions and numbers. Writes ``calibration.json``, ``calibration.md``, ``reliability.png``,
-            ``coverage.png`` and, where futures were simulated, ``truth.png`` to its folder.
+            ``coverage.png`` and, where futures were simulated, ``truth.png`` to its folder, anew after every method.
 
     Returns:
         The table in Markdown, as it was written.
 
     Raises:
         CheckpointError: If a policy's checkpoint is missing or damaged.
-        RunError: If no draw of hidden obstacles agrees with what was seen.
+        RunError: If a policy sees no map, or no draw of hidden obstacles agrees with what was seen.
     """  # noqa: DOC502 - raised by what this calls
     policies = {name: load_policy(name) for name in config.methods}
+    blind = [name for name, loaded in policies.items() if loaded.config.perception != "map"]
+    if blind:
+        msg = f"method is {blind[0]}, which sees no map; accepted: a policy that sees one"
+        raise RunError(msg)
+    origin = provenance()  # of the code that runs, whatever is changed meanwhile
     config.out.mkdir(parents=True, exist_ok=True)
     states = config.states if config.simulator == "planar" else 0
     total = len(policies) * (config.episodes * len(config.conditions) + states)
+    page = ""
     methods: dict[str, Any] = {}
     truths: dict[str, dict[str, NDArray[Any]]] = {}
     with one_thread(), tqdm(total=total, unit="episode or state", file=sys.stderr) as bar:
@@ -75,8 +82,8 @@ def calibrate(config: CalibrateConfig) -> str:
                 truths[name] = against_truth(loaded, config, task, bar.update)
                 found["truth"] = summarise(truths[name])
             methods[name] = found
-    result = {**provenance(), "config": _settings(config), "methods": methods}
-    return _write(config.out, result, truths)
+            page = _write(config.out, {**origin, "config": _settings(config), "methods": methods}, truths)
+    return page
 
 
 def calibration_task(loaded: LoadedPolicy, condition: str) -> TaskConfig:

@@ -43,7 +43,7 @@ _WORLDS = 24
 """Worlds in which the states are reached [1]."""
 _STRIDE = 10
 """Steps between two times at which states are taken [1]."""
-_FLOOR = 0.02
+_FLOOR = 0.002
 """Added to the risk, in proportion to which every second state is drawn [1]."""
 
 
