@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -18,6 +18,9 @@ from cura_torchrl.trainers.calibration import LEVELS, PROBABILITY_EDGES, Predict
 from cura_torchrl.trainers.calibration_figures import coverage_figure, reliability_figure, truth_figure
 from cura_torchrl.trainers.calibration_report import as_markdown
 from cura_torchrl.trainers.futures import decompose, summarise
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 def _estimator(state: TensorDict) -> TensorDict:
