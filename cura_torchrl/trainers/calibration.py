@@ -25,8 +25,11 @@ LEVELS = tuple(round(0.1 * number, 1) for number in range(1, 10))
 """Levels of the central intervals [1]."""
 PROBABILITY_EDGES = (0.0, 0.01, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9, 1.001)
 """Bins of the reliability diagram: finer where most predictions are [1]."""
-_GRID = np.linspace(-0.5, 1.5, 401)
-"""Where distribution functions are compared, in steps of 0.005 [1]; atoms beyond count as at its ends."""
+STAKE = 0.02
+"""Risk from which a state counts for the coverage [1]. Elsewhere, which is most of the time, the tail covers all. What
+is chosen by the prediction alone leaves a calibrated prediction calibrated."""
+_GRID = 0.001 * (np.arange(2001) - 499.5)
+"""Where distribution functions are compared, in steps of 0.001 [1]; atoms beyond count as at its ends."""
 _DRAWS = 400
 """Resamples of the episodes [1]."""
 
@@ -67,9 +70,10 @@ def realised_possibility(
         >>> value.round(2).tolist(), is_known.tolist()
         ([0.81, 0.9, 1.0], [True, True, True])
     """
-    if collided:
-        return gamma ** (steps_left - 1.0), np.ones(len(steps_left), dtype=bool)
-    return np.zeros(len(steps_left)), gamma ** np.asarray(steps_left, dtype=np.float64) <= tail
+    left = np.asarray(steps_left, dtype=np.float64)
+    value: NDArray[np.float64] = np.power(gamma, left - 1.0) if collided else np.zeros(len(left))
+    is_known: NDArray[np.bool_] = np.logical_or(collided, np.power(gamma, left) <= tail)
+    return value, is_known
 
 
 def crps(atoms: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
@@ -102,7 +106,8 @@ def measure(data: Predictions, draws: int = _DRAWS) -> dict[str, Any]:
         draws: Resamples of the episodes [1].
 
     Returns:
-        JSON-compatible. ``numbers``: by name value, lower and upper bound. ``coverage``: for each level the share that
+        JSON-compatible. ``numbers``: by name value, lower and upper bound. ``coverage``, over the states whose risk is
+        at least :data:`STAKE`: for each level the share that
         the prediction itself promises, and value and bounds of the share that came out. ``reliability``: for each bin
         of predicted probability the number of states, its mean, and value and bounds of the share that collided.
     """
@@ -112,7 +117,7 @@ def measure(data: Predictions, draws: int = _DRAWS) -> dict[str, Any]:
     below = _below(data, owner, len(episodes))
     calls: dict[str, Callable[[NDArray[np.int64]], NDArray[np.float64]]] = {
         "numbers": lambda index: np.array(list(_numbers(columns, index).values())),
-        "coverage": lambda index: columns["inside"][index].mean(0),
+        "coverage": lambda index: _covered(columns, "inside", index),
         "reliability": lambda index: _reliability(columns, index)[2],
     }
 
@@ -128,12 +133,15 @@ def measure(data: Predictions, draws: int = _DRAWS) -> dict[str, Any]:
     first, second = len(names), len(names) + len(LEVELS)
     return {
         "states": len(owner),
+        "states_at_stake": int((columns["risk"] >= STAKE).sum()),
         "episodes": len(episodes),
         "collisions_within": int(columns["label"].sum()),
         "numbers": {**dict(zip(names, table[:first], strict=True)), "pooled_energy_distance": table[-1]},
         "coverage": [
             {"level": level, "promised": float(promised), "came_out": row}
-            for level, promised, row in zip(LEVELS, columns["promised"].mean(0), table[first:second], strict=True)
+            for level, promised, row in zip(
+                LEVELS, _covered(columns, "promised", index), table[first:second], strict=True
+            )
         ],
         "reliability": [
             {"states": int(count[bin_]), "predicted": float(predicted[bin_]), "came_out": table[second + bin_]}
@@ -192,6 +200,13 @@ def _numbers(columns: dict[str, NDArray[Any]], index: NDArray[np.int64]) -> dict
         "pearson_risk_uncertainty": correlation(risk, uncertainty),
         "spearman_risk_uncertainty": float(spearmanr(risk, uncertainty)[0]) if varies else np.nan,
     }
+
+
+def _covered(columns: dict[str, NDArray[Any]], name: str, index: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the mean coverage of each level over the states at stake, NaN where there are none."""
+    chosen = index[columns["risk"][index] >= STAKE]
+    rows: NDArray[np.float64] = columns[name][chosen]
+    return rows.mean(0) if len(rows) else np.full(len(LEVELS), np.nan)
 
 
 def _reliability(columns: dict[str, NDArray[Any]], index: NDArray[np.int64]) -> tuple[NDArray[np.float64], ...]:

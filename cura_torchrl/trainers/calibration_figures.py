@@ -52,6 +52,7 @@ def coverage_figure(methods: dict[str, Any]) -> bytes:
     for axis, condition in panels:
         for (method, found), colour in zip(methods.items(), _COLOURS, strict=False):
             rows = found[condition]["coverage"]
+            rows = [row for row in rows if np.isfinite(row["promised"])]
             promised = np.array([row["promised"] for row in rows])
             _draw(axis, promised, np.array([row["came_out"] for row in rows]), label=method, colour=colour)
         axis.set_xlabel("promised coverage [1]")

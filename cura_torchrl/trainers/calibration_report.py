@@ -95,12 +95,12 @@ def _by_condition(
 def _coverage(methods: dict[str, Any]) -> str:
     rows, levels = [], []
     for method, parts in methods.items():
-        for condition in CONDITIONS.keys() & parts.keys():
+        for condition in (name for name in CONDITIONS if name in parts):
             shown = parts[condition]["coverage"][::2]
             levels = [f"{entry['level']:.0%}" for entry in shown]
             cells = [f"{entry['promised']:.2f}: {_interval(entry['came_out'], 2)}" for entry in shown]
-            rows.append([method, condition, *cells])
-    return _table(["Method", "Condition", *levels], sorted(rows, key=lambda row: list(methods).index(row[0])))
+            rows.append([method, condition, str(parts[condition]["states_at_stake"]), *cells])
+    return _table(["Method", "Condition", "States at stake", *levels], rows)
 
 
 def _truth(methods: dict[str, Any]) -> str:

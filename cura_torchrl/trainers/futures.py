@@ -169,7 +169,7 @@ def against_truth(
         many hidden obstacles there really are, ``hidden_drawn``, how many on average in the draws; ``kept``, how many
         draws agree with what was seen; ``episode``; ``by_risk``, whether it was drawn in proportion to its risk.
     """
-    options = {"task": task, "simulator": "planar"}
+    options: dict[str, Any] = {"task": task, "simulator": "planar"}
     rows, limit = config.futures, round(loaded.config.env.task.episode_time / task.policy_period)
     notes: dict[str, list[Any]] = defaultdict(list)
     generator = torch.Generator().manual_seed(config.seed)

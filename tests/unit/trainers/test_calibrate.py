@@ -155,4 +155,5 @@ def test_what_is_written_is_strict_json_with_every_state(tmp_path: Path):
     assert len(found["truth_states"]["a"]["true_mean"]) == 40
     assert {path.name for path in tmp_path.glob("*.png")} == {"reliability.png", "coverage.png", "truth.png"}
     for name in ("reliability", "coverage", "truth"):
-        assert Image.open(tmp_path / f"{name}.png").width > 300
+        with Image.open(tmp_path / f"{name}.png") as picture:
+            assert picture.width > 300

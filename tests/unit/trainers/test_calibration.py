@@ -125,3 +125,19 @@ def test_intervals_are_over_episodes_and_not_over_states():
         _, low, high = measure(data, draws=200)["numbers"]["mean_possibility"]
         width.append(high - low)
     assert width[1] == pytest.approx(width[0])
+
+
+def test_the_pooled_distance_is_that_of_all_atoms_from_all_outcomes():
+    """Catches a grid that tells 0 from 0.0004: half of the atoms at 0.5, outcomes 0, so 2 * (1/2)^2 * 0.5."""
+    atoms = np.tile(np.repeat([0.0004, 0.5], 25), (20, 1)).astype(np.float32)
+    data = Predictions(atoms=atoms, possibility=np.zeros(20), episode=np.arange(20), gamma=GAMMA)
+    assert measure(data, draws=5)["numbers"]["pooled_energy_distance"][0] == pytest.approx(0.25, abs=1e-3)
+
+
+def test_coverage_is_told_where_something_is_at_stake():
+    """Catches a coverage of 1 that is made of states in which nothing can happen."""
+    atoms = np.concatenate([np.zeros((90, 50)), np.tile(np.linspace(0.3, 0.5, 50), (10, 1))]).astype(np.float32)
+    data = Predictions(atoms=atoms, possibility=np.zeros(100), episode=np.arange(100), gamma=GAMMA)
+    found = measure(data, draws=5)
+    assert found["states_at_stake"] == 10
+    assert found["coverage"][-1]["came_out"][0] == 0.0
