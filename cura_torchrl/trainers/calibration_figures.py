@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _COLOURS = ("C0", "C1", "C2", "C3", "C4", "C5", "C6", "C7")
+_LINEAR = {"mean": 1e-2, "variance": 1e-3}
+"""Up to where the axes of the comparison with the truth are linear [1]."""
 _FEW = 20
 """States below which a bin of the reliability diagram is not drawn [1]."""
 
@@ -82,6 +84,9 @@ def truth_figure(truths: dict[str, dict[str, NDArray[Any]]]) -> bytes:
                 axis.errorbar(
                     true, predicted, xerr=error, fmt=marker, markersize=4, alpha=0.7, linewidth=0.7, label=label
                 )
+            # Linear near 0, where most states are, and logarithmic beyond.
+            axis.set_xscale("symlog", linthresh=_LINEAR[name])
+            axis.set_yscale("symlog", linthresh=_LINEAR[name])
             axis.set_title(method, loc="left", fontsize=10)
             axis.set_xlabel(f"true {unit}", fontsize=9)
             axis.grid(alpha=0.3)
