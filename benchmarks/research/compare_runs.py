@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from recording import KINDS, PERIOD, SIZES, bootstrap, save, share_of, task
+from recording import KINDS, PERIOD, SIZES, save, share_of, task
 
 from cura_torchrl.trainers.active_perception import LookingMeter
 from cura_torchrl.trainers.checkpoint import LoadedPolicy, load_policy
 from cura_torchrl.trainers.evaluate import Episode, play_episodes, summarise
+from cura_torchrl.trainers.statistics import bootstrap_interval
 from cura_torchrl.trainers.threads import one_thread
 
 PANELS = (
@@ -68,7 +69,7 @@ def paired(first: dict[str, Any], second: dict[str, Any]) -> list[float]:
         for result in (first, second)
     ]
     gain = scored[0] - scored[1]
-    return [float(gain.mean()), *bootstrap(lambda pick: float(gain[pick].mean()), len(gain))]
+    return [float(gain.mean()), *bootstrap_interval(lambda pick: float(gain[pick].mean()), len(gain))]
 
 
 def draw(runs: dict[str, dict[str, Any]]) -> Figure:

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from recording import PERIOD, bootstrap, estimator_watch, normalised_costs, parser, record, save, task
+from recording import PERIOD, estimator_watch, normalised_costs, parser, record, save, task
 from scipy.spatial import cKDTree
 
 from cura_torchrl.trainers.checkpoint import load_policy
+from cura_torchrl.trainers.statistics import bootstrap_interval
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def measure(notes: dict[str, NDArray[Any]], costs: dict[str, NDArray[np.float32]
         last = values[ends[:, 0], ends[:, 1]].astype(np.float64)
         rows = {"before": before, "last_step": last, "with_last": before + last, "safe": safe, "excess": before - safe}
         result[name] = {
-            key: [float(row.mean()), *bootstrap(lambda pick, row=row: row[pick].mean(), len(row))]
+            key: [float(row.mean()), *bootstrap_interval(lambda pick, row=row: row[pick].mean(), len(row))]
             for key, row in rows.items()
         }
         result[name]["share_negative"] = float((before + last < 0).mean())
@@ -92,7 +93,8 @@ def measure(notes: dict[str, NDArray[Any]], costs: dict[str, NDArray[np.float32]
     result["foreseen"] = {"collisions": int(foreseen.sum())}
     for name in PARTS if foreseen.any() else ():
         row = window_sums(costs[name], starts[foreseen])
-        result["foreseen"][name] = [float(row.mean()), *bootstrap(lambda pick, row=row: row[pick].mean(), len(row))]
+        bounds = bootstrap_interval(lambda pick, row=row: row[pick].mean(), len(row))
+        result["foreseen"][name] = [float(row.mean()), *bounds]
     for name in ("risk", "uncertainty", "clearance"):
         values = notes[name]
         result[f"{name}_at_start"] = [float(np.median(values[at[:, 0], at[:, 1]])) for at in (starts, matched, ends)]
@@ -108,7 +110,7 @@ def draw(notes: dict[str, NDArray[Any]], costs: dict[str, NDArray[np.float32]]) 
     curves: dict[str, Any] = {"time_s": time.round(2).tolist()}
     for axis, name in zip(figure.subplots(1, 3), PARTS, strict=True):
         rows = costs[name][ends[:, :1], ends[:, 1:] + np.arange(-HISTORY, 1)].astype(np.float64)
-        low, high = bootstrap(lambda pick, rows=rows: rows[pick].mean(0), len(rows), draws=300)
+        low, high = bootstrap_interval(lambda pick, rows=rows: rows[pick].mean(0), len(rows), draws=300)
         curves[name] = rows.mean(0).round(4).tolist()
         axis.axhline(0.0, color="0.6", linewidth=0.8)
         axis.plot(time, rows.mean(0), color="C3", label=f"before a collision ({len(rows)})")

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from lookers import PeekingPusher, SeeingPusher, SwingingPusher, WeavingPusher
 from matplotlib.figure import Figure
-from recording import KINDS, PERIOD, SIZES, bootstrap, gaps, save, share_of
+from recording import KINDS, PERIOD, SIZES, gaps, save, share_of
 
 from cura_torchrl import keys
 from cura_torchrl.envs import geometry
@@ -25,6 +25,7 @@ from cura_torchrl.envs.config import LidarConfig, PushEnvConfig, ScenarioConfig,
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.trainers.evaluate import Episode, play_episodes, summarise
+from cura_torchrl.trainers.statistics import bootstrap_interval
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ def recovered(straight: NDArray[Any], free: NDArray[Any], looking: NDArray[Any])
         return np.array([loss, gain, gain / loss if loss > 0 else np.nan])
 
     found = statistics(np.arange(len(straight)))
-    low, high = bootstrap(statistics, len(straight))
+    low, high = bootstrap_interval(statistics, len(straight))
     return {name: list(row) for name, *row in zip(("loss", "gain", "share"), found.tolist(), low, high, strict=True)}
 
 

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -24,6 +23,7 @@ from cura_torchrl.trainers.info import provenance
 from cura_torchrl.trainers.statistics import wilson_interval
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
     from torchrl.envs import EnvBase
@@ -183,21 +183,3 @@ def normalised_costs(loaded: LoadedPolicy, notes: dict[str, NDArray[Any]]) -> di
 def share_of(count: int, episodes: int) -> list[float]:
     """Return a rate with Wilson's 95 % interval [1]."""
     return [count / episodes, *wilson_interval(count, episodes)]
-
-
-def bootstrap(
-    statistic: Callable[[NDArray[np.int64]], float | NDArray[np.float64]], count: int, draws: int = 1000
-) -> list[Any]:
-    """Return the 95 % percentile interval of a statistic over resampled units.
-
-    Args:
-        statistic: From the indices of the units that were drawn, with repetition.
-        count: Units, such as episodes or states.
-        draws: Resamples.
-
-    Returns:
-        Lower and upper bound; for an array, of each entry.
-    """
-    generator = np.random.default_rng(0)
-    values = np.array([statistic(generator.integers(count, size=count)) for _ in range(draws)])
-    return np.nanquantile(values, (0.025, 0.975), axis=0).tolist()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from recording import Policy, bootstrap, estimator_watch, normalised_costs, parser, record, save, task
+from recording import Policy, estimator_watch, normalised_costs, parser, record, save, task
 from scipy.stats import rankdata, spearmanr
 
 from cura_torchrl import keys
@@ -21,7 +21,7 @@ from cura_torchrl.envs.robots.scripted import ScriptedPusher
 from cura_torchrl.envs.transforms import ConfidenceMap, EncodeMap
 from cura_torchrl.trainers.build import load_encoder
 from cura_torchrl.trainers.checkpoint import load_policy
-from cura_torchrl.trainers.statistics import correlation
+from cura_torchrl.trainers.statistics import bootstrap_interval, correlation
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def measure(notes: dict[str, NDArray[Any]]) -> dict[str, Any]:
         ])  # fmt: skip
 
     found = statistics(np.arange(len(episodes)))
-    low, high = bootstrap(statistics, len(episodes), draws=200)
+    low, high = bootstrap_interval(statistics, len(episodes), draws=200)
     rows = zip(STATISTICS, found, low, high, strict=True)
     return {
         "frames": int(notes["risk"].size),

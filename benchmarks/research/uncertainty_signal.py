@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from clone import copy_world, vary
 from matplotlib.figure import Figure
-from recording import PERIOD, bootstrap, clearance, parser, save, task
+from recording import PERIOD, clearance, parser, save, task
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from cura_torchrl import keys
 from cura_torchrl.objectives.functional import risk_cost, uncertainty_cost
 from cura_torchrl.trainers.checkpoint import load_policy
-from cura_torchrl.trainers.statistics import correlation
+from cura_torchrl.trainers.cloning import copy_world, vary
+from cura_torchrl.trainers.statistics import bootstrap_interval, correlation
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def measure(costs: NDArray[np.float64]) -> dict[str, Any]:
 
     everything = np.arange(len(costs))
     parts, found = split(costs), shares(everything)
-    low, high = bootstrap(shares, len(costs))
+    low, high = bootstrap_interval(shares, len(costs))
     alone = [shares_of for one in costs if (shares_of := _within(one)) is not None]
     return {
         "states": len(costs),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import TYPE_CHECKING
 
 import torch
@@ -116,6 +117,11 @@ class Sightings:
         self.is_fresh = torch.empty(0, dtype=torch.bool)
         """Rows in which the last state was the first of an episode, bool, shape ``[N]``."""
 
+    @property
+    def is_known(self) -> torch.Tensor:
+        """Whether a ray has hit each obstacle, bool, shape ``[N, M]``."""
+        return self.seen.isfinite()
+
     def update(self, state: TensorDictBase, playing: torch.Tensor) -> torch.Tensor:
         """Note what a state says.
 
@@ -157,12 +163,8 @@ class LookingMeter:
     def __init__(self, env: TransformedEnv, lidar: LidarConfig, period: float) -> None:
         env.append_transform(sight_map(lidar))
         self._period = period
-        self._beside: list[torch.Tensor] = []
-        self._unseen: list[torch.Tensor] = []
-        self._speed: list[torch.Tensor] = []
-        self._waits: list[torch.Tensor] = []
-        self._distances: list[torch.Tensor] = []
         self._sightings = Sightings(lidar.max_range)
+        self._notes: dict[str, list[tuple[torch.Tensor, torch.Tensor]]] = defaultdict(list)
 
     def watch(self, state: TensorDictBase, playing: torch.Tensor) -> None:
         """Note what a state says.
@@ -173,21 +175,42 @@ class LookingMeter:
         """
         parts = {name: state[keys.OBSERVATION][:, part] for name, part in OBSERVATION_SLICES.items()}
         centre, velocity = parts["object_position"][:, :2], parts["object_velocity"]
-        speed = geometry.norm(velocity)
+        speed, episode = geometry.norm(velocity), state[keys.EPISODE][:, 0]
         moves = playing & (speed > MOVING)
         ahead = velocity / speed.clamp_min(1e-6)[:, None]
-        self._speed.append(speed[playing])
-        self._beside.append((ahead[:, 0] * centre[:, 1] - ahead[:, 1] * centre[:, 0]).abs()[moves])
+        self._notes["object_speed"].append((speed[playing], episode[playing]))
+        beside = (ahead[:, 0] * centre[:, 1] - ahead[:, 1] * centre[:, 0]).abs()
+        self._notes["beside_m"].append((beside[moves], episode[moves]))
         half = parts["object_position"][:, 2:]
         moving = (state[SIGHT_MAP][moves], centre[moves], half[moves], ahead[moves])
-        self._unseen.append(unseen_ahead(*moving, _MAP.resolution))
+        unseen = unseen_ahead(*moving, _MAP.resolution)
+        area = AHEAD * 2.0 * (half[moves, 0] + MARGIN)
+        self._notes["unseen_ahead"].append((unseen, episode[moves]))
+        self._notes["seen_ahead_m2"].append(((1.0 - unseen) * area, episode[moves]))
         self._note_sightings(state, playing)
 
     def _note_sightings(self, state: TensorDictBase, playing: torch.Tensor) -> None:
         first = self._sightings.update(state, playing)
-        self._waits.append((self._period * (self._sightings.seen - self._sightings.appeared))[first])
+        wait = self._period * (self._sightings.seen - self._sightings.appeared)
         away = geometry.norm(state[keys.OBSTACLES][..., :2] - state[keys.OBJECT_POSE][:, None, :2])
-        self._distances.append(away[first])
+        episode = state[keys.EPISODE].expand_as(first)[first]
+        self._notes["first_seen_s"].append((wait[first], episode))
+        self._notes["first_seen_m"].append((away[first], episode))
+
+    def samples(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+        """Return what was noted, and in which episode.
+
+        Returns:
+            By measure the values and the episodes' indices, both of shape ``[M]``: ``object_speed`` [m/s] in every
+            state; while the object moves, ``beside_m``, how far the base is beside its way, ``unseen_ahead``, the
+            unseen share of the area ahead [1], and ``seen_ahead_m2``, the seen part of it, each cell weighted by its
+            confidence; for every obstacle that is ever hit by a ray, ``first_seen_s``, the time from its appearance to
+            the first hit, and ``first_seen_m``, the object's distance from it then.
+        """
+        return {
+            name: (torch.cat([value for value, _ in notes]), torch.cat([owner for _, owner in notes]))
+            for name, notes in self._notes.items()
+        }
 
     def summary(self) -> dict[str, float]:
         """Return the measures.
@@ -197,12 +220,12 @@ class LookingMeter:
             [m], and the mean unseen share of the area ahead [1]; time from an obstacle's appearance to the first ray
             that hits it, mean [s], and the object's distance from it then, mean [m].
         """
-        beside, waits = torch.cat(self._beside), torch.cat(self._waits)
+        found = {name: values for name, (values, _) in self.samples().items()}
         return {
-            "object_speed": torch.cat(self._speed).mean().item(),
-            "beside_median_m": beside.quantile(0.5).item(),
-            "beside_q90_m": beside.quantile(0.9).item(),
-            "unseen_ahead": torch.cat(self._unseen).mean().item(),
-            "first_seen_s": waits.mean().item(),
-            "first_seen_m": torch.cat(self._distances).mean().item(),
+            "object_speed": found["object_speed"].mean().item(),
+            "beside_median_m": found["beside_m"].quantile(0.5).item(),
+            "beside_q90_m": found["beside_m"].quantile(0.9).item(),
+            "unseen_ahead": found["unseen_ahead"].mean().item(),
+            "first_seen_s": found["first_seen_s"].mean().item(),
+            "first_seen_m": found["first_seen_m"].mean().item(),
         }

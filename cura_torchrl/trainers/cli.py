@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from cura_torchrl.trainers.bench_config import BenchConfig
+from cura_torchrl.trainers.calibration_config import CalibrateConfig
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError, RunsFailedError
@@ -299,6 +300,15 @@ def _view(arguments: list[str]) -> None:
         module.view(config)
 
 
+def _calibrate(arguments: list[str]) -> None:
+    """Compare what the collision estimator predicts with what comes of it."""
+    config = _parse(CalibrateConfig, "calibrate", arguments)
+    module = _import("cura_torchrl.trainers.calibrate")
+    with _clean_stdout():
+        page = module.calibrate(config)
+    sys.stdout.write(page)
+
+
 def _defaults(arguments: list[str]) -> TrainConfig:
     """Return what the flags of ``train`` start from: the method's preset, or the run's own configuration."""
     scout = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -394,6 +404,7 @@ _COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "report": _report,
     "view": _view,
     "render": _render,
+    "calibrate": _calibrate,
     "release": _release,
     "export": _export,
     "demo": _demo,

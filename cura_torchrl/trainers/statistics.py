@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+import warnings
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.stats import binomtest, rankdata, trim_mean
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -193,6 +194,31 @@ def share_recovered(cells: Sequence[Sequence[ArrayLike]], confidence: float = 0.
         return share, math.nan, math.nan
     low, high = np.quantile((won - with_)[has_loss] / (without - with_)[has_loss], (tail, 1.0 - tail))
     return share, float(low), float(high)
+
+
+def bootstrap_interval(
+    statistic: Callable[[NDArray[np.int64]], float | NDArray[np.float64]], count: int, draws: int = 1000
+) -> list[Any]:
+    """Return the 95 % percentile interval of a statistic over resampled units.
+
+    Args:
+        statistic: From the indices of the units that were drawn, with repetition. Draws that give NaN are left out.
+        count: Units, such as episodes or states.
+        draws: Resamples.
+
+    Returns:
+        Lower and upper bound; for an array, of each entry.
+
+    Examples:
+        >>> bootstrap_interval(lambda pick: float(pick.mean()), 1, draws=10)
+        [0.0, 0.0]
+    """
+    generator = np.random.default_rng(0)
+    values = np.array([statistic(generator.integers(count, size=count)) for _ in range(draws)])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "All-NaN", RuntimeWarning)
+        bounds: list[Any] = np.nanquantile(values, (0.025, 0.975), axis=0).tolist()
+    return bounds
 
 
 def area_under_roc(scores: ArrayLike, labels: ArrayLike) -> float:

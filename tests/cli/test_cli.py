@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from cura_torchrl.trainers.bench_config import BenchConfig
+from cura_torchrl.trainers.calibration_config import CalibrateConfig
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.demo_config import DemoConfig
@@ -63,7 +64,19 @@ def test_help_lists_every_command_and_method() -> None:
     done = run("--help")
     assert done.returncode == 0
     learning = ("pretrain-map", "imitate", "train", "train-all")
-    others = ("evaluate", "table", "render", "report", "view", "release", "export", "demo", "bench", "info")
+    others = (
+        "evaluate",
+        "table",
+        "calibrate",
+        "render",
+        "report",
+        "view",
+        "release",
+        "export",
+        "demo",
+        "bench",
+        "info",
+    )
     for name in (*learning, *others, *PRESETS):
         assert name in done.stdout
 
@@ -78,6 +91,7 @@ def test_help_lists_every_command_and_method() -> None:
         ("report", ReportConfig),
         ("view", ViewConfig),
         ("render", RenderConfig),
+        ("calibrate", CalibrateConfig),
         ("demo", DemoConfig),
         ("export", ExportConfig),
         ("bench", BenchConfig),
@@ -147,6 +161,9 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
         (["render", "--formats", "png,jpg"], "format is 'jpg'; accepted: png, svg, mp4, gif, webp"),
         (["render", "--figures", "path"], "figure is 'path'; accepted: all, none, paths, snapshots, "),
         (["render", "--times", "3", "1"], "times is (3.0, 1.0); accepted: at most 6 growing times [s]"),
+        (["calibrate", "--methods", "cura-pp"], "method is 'cura-pp'; accepted: cura-no-risk, "),
+        (["calibrate", "--conditions", "night"], "condition is 'night'; accepted: on-policy, big-object, "),
+        (["calibrate", "--repeats", "3"], "repeats is 3; accepted: a divisor of 256 futures"),
         (["bench"], "env,learner,lidar,ik,peers"),
         (["bench", "speed"], "speed"),
         (["bench", "env", "--rounds", "0"], "rounds is 0; accepted: 1 or more"),

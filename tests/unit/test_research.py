@@ -9,11 +9,6 @@ from types import ModuleType
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import Compose, TransformedEnv
-
-from cura_torchrl.envs.config import MapConfig, PushEnvConfig
-from cura_torchrl.envs.push import PushEnv
-from cura_torchrl.envs.transforms import ConfidenceMap
 
 Load = Callable[[str], ModuleType]
 
@@ -23,46 +18,6 @@ def load(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Loa
     """Return what imports an experiment's module, which is in no package."""
     monkeypatch.syspath_prepend(request.config.rootpath / "benchmarks" / "research")
     return importlib.import_module
-
-
-def _env(rows: int) -> TransformedEnv:
-    env = PushEnv(rows, PushEnvConfig(simulator="planar"), seed=5)
-    coarse = MapConfig(resolution=0.5, window=20)
-    return TransformedEnv(env, Compose(ConfidenceMap(coarse, num_rays=360, max_range=10.0)))
-
-
-def test_clones_of_a_world_go_on_exactly_as_it_does(load: Load) -> None:
-    """Catches a part of the state that is not copied: clones would drift from their world."""
-    clone = load("clone")
-    source, target = _env(3), _env(4)
-    state = source.rollout(6)[:, -1]["next"]
-    target.rand_step(target.reset())
-    clone.copy_world(source, 2, target)
-    action = torch.full((1, 6), 0.5)
-    for _ in range(3):
-        state = source.step(state.set("action", action.expand(3, 6)))["next"]
-        copies = target.step(TensorDict({"action": action.expand(4, 6)}, [4]))["next"]
-        for key in ("observation", "scan", "object_pose", "confidence_map"):
-            # Batches of another size round differently in the last bits.
-            torch.testing.assert_close(copies[key], state[key][2:].expand_as(copies[key]), atol=1e-5, rtol=0.0)
-
-
-def test_varied_clones_differ_in_noise_and_in_obstacles_to_come(load: Load) -> None:
-    """Catches seeds that change nothing, or that move the robot or the obstacles that are there."""
-    clone = load("clone")
-    source, target = _env(3), _env(4)
-    source.rollout(3)
-    target.rand_step(target.reset())
-    clone.copy_world(source, 0, target)
-    present, where, _ = target.base_env.obstacles
-    clone.vary(target, torch.arange(4))
-    copies = target.step(TensorDict({"action": torch.zeros(4, 6)}, [4]))["next"]
-    assert (copies["scan"][0] - copies["scan"][1]).abs().max() > 1e-3
-    assert torch.equal(copies["object_pose"], copies["object_pose"][:1].expand(4, 3))
-    assert torch.equal(target.base_env.obstacles[1][present], where[present])
-    times = target.base_env.scenario["obstacle_time"][~present]
-    assert ((times >= 0.6) & (times <= 15.0) | (times == 1e9)).all()  # three steps have been played
-    assert len(times.unique()) > 2
 
 
 def test_a_seeing_pusher_knows_an_obstacle_once_a_ray_has_hit_it(load: Load) -> None:

@@ -201,6 +201,16 @@ class ConfidenceMap(Transform):
             return self._reset(tensordict.empty(), tensordict)
         return self._call(tensordict)
 
+    def age(self) -> torch.Tensor:
+        """Return how long ago each cell of the global map was last observed, as free or as occupied.
+
+        Returns:
+            Steps, 0 for what the last scan has observed and infinite for what none has, in the layout of ``grid``,
+            shape ``[N, num_rows, num_columns]``.
+        """
+        stamps = self._stamps.floor()
+        return torch.where(stamps > 0, self._steps[:, None, None] - stamps, torch.inf)
+
     @torch.no_grad()
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         inputs = self._read(next_tensordict)

@@ -83,7 +83,7 @@ def vary(env: EnvBase, seeds: torch.Tensor) -> None:
     sizes, yaws and places are drawn anew. Those that have appeared stay, also where no ray has met them yet.
 
     Args:
-        env: Environment whose worlds are all in the same state, as :func:`copy_world` leaves them.
+        env: Environment whose worlds are all at the same time, as :func:`copy_world` leaves them.
         seeds: One seed a world, int64, shape ``[N]``.
     """
     base = env.base_env
@@ -95,9 +95,7 @@ def vary(env: EnvBase, seeds: torch.Tensor) -> None:
     present = base.obstacles[0]
     time = float(base._elapsed[0]) * base.config.task.policy_period
     last = config.obstacle_time[1]
-    more = _draw_more(
-        int(present[0].sum()), max(0.0, 1.0 - time / last), config.max_obstacles, fresh["goal_pose"][:, 2]
-    )
+    more = _draw_more(present.sum(-1), max(0.0, 1.0 - time / last), config.max_obstacles, fresh["goal_pose"][:, 2])
     order = fresh["obstacle_yaw"].masked_fill(present, torch.inf).argsort(-1).argsort(-1)
     share = (fresh["obstacle_time"] - config.obstacle_time[0]) / (last - config.obstacle_time[0])
     appears = torch.where(order < more[:, None], time + share * (last - time), _NEVER)
@@ -109,10 +107,42 @@ def vary(env: EnvBase, seeds: torch.Tensor) -> None:
     scene["obstacle_place"] = torch.where(present[..., None, None], scene["obstacle_place"], fresh["obstacle_place"])
 
 
-def _draw_more(there: int, left: float, most: int, angle: torch.Tensor) -> torch.Tensor:
+def put_obstacles(env: EnvBase, pose: torch.Tensor, edge: torch.Tensor, adversarial: torch.Tensor) -> None:
+    """Put obstacles in place of those that have appeared, without telling the robot: nothing is scanned.
+
+    Args:
+        env: Environment on the planar simulator.
+        pose: Obstacles (x [m], y [m], yaw [rad]), world frame, float64, shape ``[N, 6, 3]``.
+        edge: Their edges [m], 0 where there is none, float64, shape ``[N, 6]``.
+        adversarial: Whether those still to come appear on the object-to-goal line, bool, shape ``[N]``.
+    """
+    base, is_there = env.base_env, edge > 0
+    base._obstacle_active, base._obstacle_pose = is_there.clone(), pose.clone()
+    base.scenario["obstacle_edge"] = torch.where(is_there, edge, base.scenario["obstacle_edge"])
+    base.scenario["adversarial"] = adversarial.clone()
+    base._worlds.place_obstacles(torch.ones_like(is_there), pose, edge)
+
+
+def remove_obstacles(env: EnvBase, rows: torch.Tensor) -> None:
+    """Leave worlds without obstacles, now and until their reset: what goes on after a collision drives through them.
+
+    Args:
+        env: Environment on the planar simulator.
+        rows: Which worlds, bool, shape ``[N]``.
+    """
+    base = env.base_env
+    base._obstacle_active = base._obstacle_active & ~rows[:, None]
+    base.scenario["num_obstacles"] = base.scenario["num_obstacles"].masked_fill(rows, 0)
+    edge = torch.where(base._obstacle_active, base.scenario["obstacle_edge"], 0.0)
+    base._worlds.place_obstacles(rows[:, None].expand_as(edge), base._obstacle_pose, edge)
+
+
+def _draw_more(there: torch.Tensor, left: float, most: int, angle: torch.Tensor) -> torch.Tensor:
     """Return how many obstacles are still to come, drawn from its distribution by uniform angles, int64, ``[N]``."""
-    more = torch.arange(most - there + 1, dtype=torch.float64)
-    ways = torch.lgamma(there + more + 1) - torch.lgamma(more + 1)
-    weight = torch.exp(ways) * left**more
-    uniform = (angle / (2 * torch.pi) + 0.5).clamp(0.0, 1.0 - 1e-12)
-    return torch.searchsorted((weight / weight.sum()).cumsum(0), uniform)
+    more = torch.arange(most + 1, dtype=torch.float64)
+    total = there[:, None] + more
+    ways = torch.lgamma(total + 1) - torch.lgamma(more + 1)
+    ways = ways - ways[:, :1]  # C(a + f, a) up to a factor of the row, which must not overflow
+    weight = torch.where(total <= most, torch.exp(ways) * left**more, 0.0)
+    uniform = (angle / (2 * torch.pi) + 0.5).clamp(0.0, 1.0 - 1e-12)[:, None]
+    return torch.searchsorted((weight / weight.sum(-1, keepdim=True)).cumsum(-1), uniform).squeeze(-1)
