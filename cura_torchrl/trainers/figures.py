@@ -14,7 +14,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
-from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
+from cura_torchrl.envs.robots.ridgeback_franka import HOME_TCP
 from cura_torchrl.trainers import raster
 from cura_torchrl.trainers.raster import rectangle_corners, two_digits
 
@@ -153,7 +154,7 @@ def _draw_sizes(axis: Any, config: ScenarioConfig) -> None:
     """Draw robot and largest object at their start, and an obstacle of each size."""
     edge = max(config.object_edges)
     hand = -edge / 2 - float(np.mean(config.start_gap))
-    base = (hand - model.HOME_TCP[0], 0.0, 0.0)
+    base = (hand - HOME_TCP[0], 0.0, 0.0)
     _draw_robot(axis, base, (hand, 0.0))
     axis.add_patch(Polygon(rectangle_corners((0.0, 0.0, 0.0), edge, edge), facecolor=raster.OBJECT))
     _write(axis, "robot", base[:2], up=-24, fontsize=9)
@@ -231,14 +232,14 @@ def _draw_paths(axis: Any, recording: Recording) -> None:
             label.set_path_effects([withStroke(linewidth=2.0, foreground="white")])
     every = round(_POSE_TIME / recording.period)
     for step in range(0, len(recording.times), every):
-        robot = rectangle_corners(recording.base_pose[step], *model.CHASSIS_SIZE)
+        robot = rectangle_corners(recording.base_pose[step], *CHASSIS_SIZE)
         box = rectangle_corners(recording.object_pose[step], edge, edge)
         _outline(axis, robot, raster.ROBOT, alpha=0.35, linewidth=0.8)
         _outline(axis, box, raster.OBJECT, alpha=0.35, linewidth=0.8)
     axis.plot(*recording.base_pose[:, :2].T, color=raster.ROBOT, linewidth=2.0)
     axis.plot(*recording.object_pose[:, :2].T, color=raster.OBJECT, linewidth=2.0, linestyle=(0, (4, 1)))
     axis.plot(*recording.object_pose[0, :2], "o", color=raster.OBJECT, markerfacecolor="white", markersize=5)
-    _draw_robot(axis, recording.base_pose[-1], recording.tcp[-1])
+    _draw_robot(axis, recording.base_pose[-1], recording.tcp[-1] if recording.has_arm else None)
     axis.add_patch(Polygon(rectangle_corners(recording.object_pose[-1], edge, edge), facecolor=raster.OBJECT))
     if recording.outcome == "collision":
         bodies = (recording.base_pose, recording.tcp, recording.object_pose)
@@ -248,8 +249,9 @@ def _draw_paths(axis: Any, recording: Recording) -> None:
 
 
 def _draw_robot(axis: Any, base: Any, tcp: Any) -> None:
-    axis.add_patch(Polygon(rectangle_corners(base, *model.CHASSIS_SIZE), facecolor=raster.ROBOT))
-    axis.plot([base[0], tcp[0]], [base[1], tcp[1]], color=raster.ARM, linewidth=3.0, solid_capstyle="round")
+    axis.add_patch(Polygon(rectangle_corners(base, *CHASSIS_SIZE), facecolor=raster.ROBOT))
+    if tcp is not None:
+        axis.plot([base[0], tcp[0]], [base[1], tcp[1]], color=raster.ARM, linewidth=3.0, solid_capstyle="round")
 
 
 def _draw_maps(axes: Sequence[Any], recording: Recording, frames: Sequence[int], *, channel: int) -> None:
@@ -266,7 +268,7 @@ def _draw_maps(axes: Sequence[Any], recording: Recording, frames: Sequence[int],
             interpolation="nearest",
         )
         edge, step = recording.scene.object_edge, int(recording.frame_steps[frame])
-        _outline(axis, rectangle_corners((0.0, 0.0, 0.0), *model.CHASSIS_SIZE), raster.ROBOT, linewidth=1.6)
+        _outline(axis, rectangle_corners((0.0, 0.0, 0.0), *CHASSIS_SIZE), raster.ROBOT, linewidth=1.6)
         _outline(axis, rectangle_corners(recording.object_in_base(step), edge, edge), raster.OBJECT, linewidth=1.6)
         quantity = "confidence" if channel == 0 else "occupancy"
         axis.set_title(f"{name}: {quantity}, {recording.times[step]:.1f} s", fontsize=8, loc="left")

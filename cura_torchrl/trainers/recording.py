@@ -16,7 +16,8 @@ from cura_torchrl import keys
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
-from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
+from cura_torchrl.envs.robots.ridgeback_franka import HOME_TCP
 from cura_torchrl.modules.functional import atom_mean, atom_variance
 from cura_torchrl.trainers.evaluate import Episode, play_episodes
 
@@ -99,6 +100,12 @@ class Recording:
         """U, the atoms' variance [1], shape ``[T]``."""
         return atom_variance(torch.from_numpy(self.atoms)).numpy()
 
+    @cached_property
+    def has_arm(self) -> bool:
+        """Whether the TCP is a hand's, and not the centre of the chassis' front face."""
+        reach = np.hypot(*(self.tcp - self.base_pose[:, :2]).T)
+        return bool((reach > CHASSIS_SIZE[0] / 2 + scenarios.ARM_LEAST_REACH).any())
+
     @property
     def end_time(self) -> float:
         """Time of goal, collision or time-out [s]."""
@@ -174,12 +181,12 @@ class Recording:
     def _bodies(self) -> tuple[torch.Tensor, torch.Tensor]:
         # Chassis, arm and object as rectangles: poses [T, 3, 3] and half extents [T, 3, 2].
         base, tcp = torch.from_numpy(self.base_pose).double(), torch.from_numpy(self.tcp).double()
-        chassis_half = base.new_tensor(model.CHASSIS_SIZE) / 2
+        chassis_half = base.new_tensor(CHASSIS_SIZE) / 2
         front = geometry.from_frame(base, torch.stack([chassis_half[0], base.new_tensor(0.0)]).expand(len(base), 2))
         reach = tcp - front
         arm = torch.cat([(front + tcp) / 2, geometry.angle_of(reach)[:, None]], -1)
         length = geometry.norm(reach)
-        arm_half = torch.stack([length / 2, torch.full_like(length, scenarios.ARM_HALF_WIDTH)], -1)
+        arm_half = torch.stack([length / 2, scenarios.arm_half_width(length)], -1)
         object_half = base.new_full((len(base), 2), self.scene.object_edge / 2)
         pose = torch.stack([base, arm, torch.from_numpy(self.object_pose).double()], 1)
         return pose, torch.stack([chassis_half.expand(len(base), 2), arm_half, object_half], 1)
@@ -212,7 +219,7 @@ def choose_scenes(config: ScenarioConfig, *, seed: int, count: int) -> list[Scen
         seed=seed,
         episodes=torch.arange(_SEARCHED),
         max_obstacles=config.max_obstacles,
-        tcp_reach=model.HOME_TCP[0],
+        tcp_reach=HOME_TCP[0],
     )
     found: dict[tuple[bool, float], list[Scene]] = defaultdict(list)
     for index in (drawn["num_obstacles"] >= min(1, config.max_obstacles)).nonzero().flatten().tolist():

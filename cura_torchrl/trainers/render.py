@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image, ImageDraw
 
-from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots import ridgeback as model
 from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.trainers import raster
 from cura_torchrl.trainers.raster import SCALE, Axis, Panel, font, rectangle_corners
@@ -273,10 +273,11 @@ def _draw_bodies(draw: ImageDraw.ImageDraw, panel: Panel, recording: Recording, 
     edge, base = recording.scene.object_edge, recording.base_pose[step]
     draw.polygon(panel.pixels(rectangle_corners(recording.object_pose[step], edge, edge)), fill=raster.OBJECT)
     draw.polygon(panel.pixels(rectangle_corners(base, *model.CHASSIS_SIZE)), fill=raster.ROBOT)
-    arm = panel.pixels(np.stack([base[:2], recording.tcp[step]]))
-    draw.line(arm, fill=raster.ARM, width=6)
-    x, y = arm[1]
-    draw.ellipse([x - 4, y - 4, x + 4, y + 4], fill=raster.ARM)
+    if recording.has_arm:
+        arm = panel.pixels(np.stack([base[:2], recording.tcp[step]]))
+        draw.line(arm, fill=raster.ARM, width=6)
+        x, y = arm[1]
+        draw.ellipse([x - 4, y - 4, x + 4, y + 4], fill=raster.ARM)
 
 
 def _draw_map(column: _Column, panel: Panel, index: int, colours: NDArray[np.uint8]) -> Image.Image:
