@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,13 +16,15 @@ from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.observations import observation_size, observe
 from cura_torchrl.envs.mdp.rewards import REWARD_TERM_NAMES, reward_terms
 from cura_torchrl.envs.mdp.terminations import endings, latch_success, success_flags
-from cura_torchrl.envs.robots.base_controller import BaseController
 from cura_torchrl.envs.robots.robot import ROBOT_MODELS
 from cura_torchrl.envs.sensors.lidar import Lidar
 from cura_torchrl.envs.sensors.noise import noise_key
 from cura_torchrl.envs.simulation.bullet import BulletWorlds
 from cura_torchrl.envs.simulation.interface import SceneState, Worlds, WorldState
 from cura_torchrl.envs.simulation.planar import PlanarWorlds
+
+if TYPE_CHECKING:
+    from cura_torchrl.envs.robots.base_controller import BaseController
 
 
 class PushEnv(EnvBase):

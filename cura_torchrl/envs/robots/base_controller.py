@@ -169,7 +169,11 @@ class BaseController:
         return torque
 
     def _base_force(self, position: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
-        """Move the base's command on by one tick, and return the servo's force before the implicit gain ``[N, 3]``."""
+        """Move the base's command on by one tick.
+
+        Returns:
+            The servo's force before the implicit gain, shape ``[N, 3]``.
+        """
         self.base_command += self._ramp_step(self.base_command, self._base_target)
         return self._constants[1, :BASE_DOF] * (
             self._to_world(self.base_command, position[:, 2]) - velocity[:, :BASE_DOF]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
@@ -11,12 +12,11 @@ from cura_torchrl.envs.robots import ridgeback, ridgeback_franka
 from cura_torchrl.envs.robots.base_controller import BaseController
 from cura_torchrl.envs.robots.controller import ImpedanceController
 from cura_torchrl.envs.robots.dynamics import BaseDynamics, RobotDynamics
+from cura_torchrl.envs.simulation.interface import RobotShape
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from cura_torchrl.envs.config import RobotName
-    from cura_torchrl.envs.simulation.interface import RobotShape, WorldState
+    from cura_torchrl.envs.simulation.interface import WorldState
 
 
 @dataclass(frozen=True, kw_only=True)

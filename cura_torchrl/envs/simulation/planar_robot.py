@@ -94,8 +94,8 @@ class PlanarRobot:
     def stopped(
         self,
         velocity: torch.Tensor,
-        position: torch.Tensor,
-        inverse_inertia: torch.Tensor,
+        position: torch.Tensor,  # noqa: ARG002 - a base has no stops
+        inverse_inertia: torch.Tensor,  # noqa: ARG002
         period: float,  # noqa: ARG002
     ) -> torch.Tensor:
         """Return joint velocities that lead no joint past its stops.
