@@ -336,14 +336,10 @@ class PushEnv(EnvBase):
             tcp_position=tcp_w,
             action=action.double(),
             previous_action=self._previous_action.double(),
-            joint_acceleration=self._joint_acceleration(before),
+            joint_acceleration=self._robot.rewarded_acceleration(before, state, task.policy_period),
         )
         self._terms = terms.float()
         return state.contact.any(-1, keepdim=True).float(), self._terms.sum(-1, keepdim=True)
-
-    def _joint_acceleration(self, before: WorldState) -> torch.Tensor:
-        change = self._robot.rewarded_velocity(self.world_state) - self._robot.rewarded_velocity(before)
-        return change / self.config.task.policy_period
 
     def _emit(self) -> TensorDict:
         """Return every observation as fresh tensors."""

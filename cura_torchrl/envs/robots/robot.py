@@ -42,16 +42,20 @@ class RobotModel:
     dynamics: type[RobotDynamics | BaseDynamics]
     """Its inertia, for simulators that have none of their own."""
 
-    def rewarded_velocity(self, state: WorldState) -> torch.Tensor:
-        """Return the velocities of the joints whose acceleration the reward counts.
+    def rewarded_acceleration(self, before: WorldState, after: WorldState, period: float) -> torch.Tensor:
+        """Return the mean acceleration of the joints that the reward counts.
 
         Args:
-            state: State of N worlds.
+            before: State of N worlds.
+            after: Their state some time later.
+            period: That time [s].
 
         Returns:
-            Velocities [m/s, rad/s], shape ``[N, K]``.
+            Accelerations [m/s^2, rad/s^2], shape ``[N, K]``.
         """
-        return torch.cat([state.base_velocity, state.joint_velocity], dim=-1)[:, self.rewarded_joints]
+        velocities = (torch.cat([state.base_velocity, state.joint_velocity], dim=-1) for state in (before, after))
+        start, end = (velocity[:, self.rewarded_joints] for velocity in velocities)
+        return (end - start) / period
 
 
 ROBOT_MODELS: dict[RobotName, RobotModel] = {
