@@ -83,7 +83,7 @@ def make() -> Iterator[Any]:
 
 def steady(env: PushEnv, steps: int, *action: float) -> torch.Tensor:
     """Return one action for all rows and steps, shape ``[T, N, 6]``."""
-    return torch.tensor(action).expand(steps, env.num_envs, 6)
+    return torch.tensor(action).expand(steps, env.num_envs, len(action))
 
 
 def obstructed(x: float, y: float, **overrides: Any) -> PushEnvConfig:
