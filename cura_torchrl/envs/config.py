@@ -14,6 +14,7 @@ from typing import Literal
 ScenarioKind = Literal["uniform", "adversarial", "mixed"]
 Stream = Literal["train", "eval", "vae"]
 Simulator = Literal["bullet", "planar"]
+RobotName = Literal["ridgeback_franka", "ridgeback"]
 
 
 def require(condition: bool, what: str, value: object, accepted: str) -> None:
@@ -206,6 +207,8 @@ class TaskConfig:
 class RobotConfig:
     """Limits and control gains of Ridgeback and Panda."""
 
+    model: RobotName = "ridgeback_franka"
+    """Which robot: Ridgeback with a Franka arm, which pushes with its hand; or without, which pushes with its front."""
     max_base_speed: float = 0.8
     """Largest base speed [m/s]; the paper's v_max."""
     max_base_yaw_rate: float = 1.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,19 +13,18 @@ from cura_torchrl import keys
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.config import PushEnvConfig
 from cura_torchrl.envs.mdp import scenarios
-from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE, observe
+from cura_torchrl.envs.mdp.observations import observation_size, observe
 from cura_torchrl.envs.mdp.rewards import REWARD_TERM_NAMES, reward_terms
 from cura_torchrl.envs.mdp.terminations import endings, latch_success, success_flags
-from cura_torchrl.envs.robots import ridgeback_franka as model
-from cura_torchrl.envs.robots.controller import ImpedanceController
-from cura_torchrl.envs.robots.dynamics import RobotDynamics
+from cura_torchrl.envs.robots.robot import ROBOT_MODELS
 from cura_torchrl.envs.sensors.lidar import Lidar
 from cura_torchrl.envs.sensors.noise import noise_key
 from cura_torchrl.envs.simulation.bullet import BulletWorlds
 from cura_torchrl.envs.simulation.interface import SceneState, Worlds, WorldState
 from cura_torchrl.envs.simulation.planar import PlanarWorlds
 
-ACTION_SIZE = 6
+if TYPE_CHECKING:
+    from cura_torchrl.envs.robots.base_controller import BaseController
 
 
 class PushEnv(EnvBase):
@@ -73,6 +72,7 @@ class PushEnv(EnvBase):
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.config = PushEnvConfig() if config is None else config
         self.num_envs = num_envs
+        self._robot = ROBOT_MODELS[self.config.robot.model]
         self.frames_done = frames_done
         self._frames_per_step = num_envs if frames_per_step is None else frames_per_step
         self._stride = num_envs if episode_stride is None else episode_stride
@@ -87,16 +87,15 @@ class PushEnv(EnvBase):
         self._make_buffers()
         self.set_seed(seed)
 
-    def _make_worlds(self) -> tuple[Worlds, ImpedanceController]:
-        config, rows = self.config, self.num_envs
+    def _make_worlds(self) -> tuple[Worlds, BaseController]:
+        config, rows, robot = self.config, self.num_envs, self._robot
         if config.simulator == "planar":
             period = config.physics.planar_period
-            controller = ImpedanceController(rows, config.robot, period, device=self._home)
-            worlds = PlanarWorlds(rows, RobotDynamics(self._home), model.SHAPE, config.physics, self._home)
+            controller = robot.controller(rows, config.robot, period, device=self._home)
+            worlds = PlanarWorlds(rows, robot.dynamics(self._home), robot.shape, config.physics, self._home)
             return worlds, controller
-        joints = model.BASE_JOINTS + model.ARM_JOINTS
-        controller = ImpedanceController(rows, config.robot, config.physics.control_period)
-        return BulletWorlds(rows, model.URDF, joints, config.physics), controller
+        controller = robot.controller(rows, config.robot, config.physics.control_period)
+        return BulletWorlds(rows, robot.urdf, robot.joints, config.physics), controller
 
     def _make_specs(self) -> None:
         rows, rays = self.num_envs, self.config.lidar.num_rays
@@ -112,7 +111,7 @@ class PushEnv(EnvBase):
 
         self.observation_spec = Composite(
             {
-                keys.OBSERVATION: real(OBSERVATION_SIZE),
+                keys.OBSERVATION: real(observation_size(self._robot.action_size)),
                 keys.SCAN: Bounded(0.0, self.config.lidar.max_range, shape=(rows, rays), dtype=torch.float32),
                 keys.SENSOR_POSE: real(3),
                 keys.OBJECT_POSE: real(3),
@@ -128,7 +127,7 @@ class PushEnv(EnvBase):
         )
         if self.config.task.privileged:
             self.observation_spec[keys.OBSTACLES] = real(scenarios.OBSTACLE_SLOTS, 4)
-        self.action_spec = Bounded(-1.0, 1.0, shape=(rows, ACTION_SIZE), dtype=torch.float32)
+        self.action_spec = Bounded(-1.0, 1.0, shape=(rows, self._robot.action_size), dtype=torch.float32)
         self.full_reward_spec = Composite({keys.REWARD: real(1), keys.COST: real(1)}, shape=(rows,))
         self.full_done_spec = Composite({"done": flag(1), "terminated": flag(1), "truncated": flag(1)}, shape=(rows,))
 
@@ -142,11 +141,10 @@ class PushEnv(EnvBase):
         self._elapsed, self._age, self._episode = (zeros(dtype=torch.int64) for _ in range(3))
         self._since_success = zeros(dtype=torch.int64) - 1
         self._success, self._tipped = zeros(len(self.config.task.tolerances), dtype=torch.bool), zeros(dtype=torch.bool)
-        self._previous_action = zeros(ACTION_SIZE, dtype=torch.float32)
+        self._previous_action = zeros(self._robot.action_size, dtype=torch.float32)
         self._terms = zeros(len(REWARD_TERM_NAMES), dtype=torch.float32)
         self._state: WorldState | None = None
         self._scan = zeros(self.config.lidar.num_rays, dtype=torch.float32)
-        self._tcp, self._hand_rotation, self._jacobian = zeros(3), zeros(3, 3), zeros(6, 7)
         self._all_rows = torch.arange(rows, device=self._home)
         self.scenario = self._sample(self._all_rows)
 
@@ -180,7 +178,7 @@ class PushEnv(EnvBase):
         task = self.config.task
         return scenarios.sample_scenarios(
             task.scenario, stream=task.stream, seed=getattr(self, "_scenario_seed", 0), episodes=episodes,
-            max_obstacles=self.max_obstacles, tcp_reach=model.HOME_TCP[0],
+            max_obstacles=self.max_obstacles, tcp_reach=self._robot.tcp[0],
         )  # fmt: skip
 
     def _set_seed(self, seed: int | None) -> None:
@@ -234,7 +232,7 @@ class PushEnv(EnvBase):
     def _build(self, rows: torch.Tensor) -> None:
         scene = self.scenario[rows]
         task, edge = self.config.task.scenario, scene["object_edge"]
-        arm = edge.new_tensor(model.HOME).expand(len(rows), -1)
+        arm = edge.new_tensor(self._robot.home).expand(len(rows), -1)
         start = SceneState(
             joint_position=torch.cat([scene["robot_pose"], arm], dim=-1),
             object_edge=edge,
@@ -338,7 +336,7 @@ class PushEnv(EnvBase):
             tcp_position=tcp_w,
             action=action.double(),
             previous_action=self._previous_action.double(),
-            joint_acceleration=(state.joint_velocity - before.joint_velocity) / task.policy_period,
+            joint_acceleration=self._robot.rewarded_acceleration(before, state, task.policy_period),
         )
         self._terms = terms.float()
         return state.contact.any(-1, keepdim=True).float(), self._terms.sum(-1, keepdim=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image, ImageDraw
 
-from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
 from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.trainers import raster
 from cura_torchrl.trainers.raster import SCALE, Axis, Panel, font, rectangle_corners
@@ -312,11 +312,12 @@ def _draw_obstacles(draw: ImageDraw.ImageDraw, panel: Panel, recording: Recordin
 def _draw_bodies(draw: ImageDraw.ImageDraw, panel: Panel, recording: Recording, step: int) -> None:
     edge, base = recording.scene.object_edge, recording.base_pose[step]
     draw.polygon(panel.pixels(rectangle_corners(recording.object_pose[step], edge, edge)), fill=raster.OBJECT)
-    draw.polygon(panel.pixels(rectangle_corners(base, *model.CHASSIS_SIZE)), fill=raster.ROBOT)
-    arm = panel.pixels(np.stack([base[:2], recording.tcp[step]]))
-    draw.line(arm, fill=raster.ARM, width=6)
-    x, y = arm[1]
-    draw.ellipse([x - 4, y - 4, x + 4, y + 4], fill=raster.ARM)
+    draw.polygon(panel.pixels(rectangle_corners(base, *CHASSIS_SIZE)), fill=raster.ROBOT)
+    if recording.has_arm:
+        arm = panel.pixels(np.stack([base[:2], recording.tcp[step]]))
+        draw.line(arm, fill=raster.ARM, width=6)
+        x, y = arm[1]
+        draw.ellipse([x - 4, y - 4, x + 4, y + 4], fill=raster.ARM)
 
 
 def _draw_map(column: _Column, panel: Panel, index: int, colours: NDArray[np.uint8]) -> Image.Image:
@@ -325,7 +326,7 @@ def _draw_map(column: _Column, panel: Panel, index: int, colours: NDArray[np.uin
     image = map_image(recording.maps[index, channel], colours, panel.width * SCALE)
     draw = ImageDraw.Draw(image)
     edge, pose = recording.scene.object_edge, recording.object_in_base(step)
-    draw.polygon(panel.pixels(rectangle_corners((0.0, 0.0, 0.0), *model.CHASSIS_SIZE)), outline=raster.ROBOT, width=4)
+    draw.polygon(panel.pixels(rectangle_corners((0.0, 0.0, 0.0), *CHASSIS_SIZE)), outline=raster.ROBOT, width=4)
     draw.polygon(panel.pixels(rectangle_corners(pose, edge, edge)), outline=raster.OBJECT, width=4)
     return image
 

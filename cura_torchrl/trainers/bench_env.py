@@ -14,7 +14,8 @@ import torch
 
 from cura_torchrl import keys
 from cura_torchrl.envs.config import PushEnvConfig
-from cura_torchrl.envs.push import ACTION_SIZE, PushEnv
+from cura_torchrl.envs.push import PushEnv
+from cura_torchrl.envs.robots.ridgeback_franka import ACTION_SIZE
 from cura_torchrl.envs.simulation.bullet_floor import BulletFloor
 from cura_torchrl.trainers.bench_report import Report, measure, rates, timed
 

@@ -12,7 +12,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from cura_torchrl import keys
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE
-from cura_torchrl.envs.push import ACTION_SIZE
+from cura_torchrl.envs.robots.ridgeback_franka import ACTION_SIZE
 from cura_torchrl.modules import DistributionalCollisionEstimator, make_actor, make_critic
 from cura_torchrl.objectives import CURALoss
 from cura_torchrl.objectives.energy import energy_distance

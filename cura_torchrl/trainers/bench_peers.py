@@ -15,7 +15,8 @@ import torch
 from torchrl.envs import ParallelEnv
 
 from cura_torchrl import keys
-from cura_torchrl.envs.push import ACTION_SIZE, PushEnv
+from cura_torchrl.envs.push import PushEnv
+from cura_torchrl.envs.robots.ridgeback_franka import ACTION_SIZE
 from cura_torchrl.trainers import bench_env
 from cura_torchrl.trainers.bench_report import Report, measure, rates
 from cura_torchrl.trainers.errors import UnavailableError

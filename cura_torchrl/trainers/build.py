@@ -17,8 +17,9 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from cura_torchrl import keys
-from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE
-from cura_torchrl.envs.push import ACTION_SIZE, PushEnv
+from cura_torchrl.envs.mdp.observations import observation_size
+from cura_torchrl.envs.push import PushEnv
+from cura_torchrl.envs.robots.robot import ROBOT_MODELS
 from cura_torchrl.envs.transforms import ConfidenceMap, EncodeMap
 from cura_torchrl.modules import (
     DistributionalCollisionEstimator,
@@ -58,11 +59,12 @@ class Networks(nn.Module):
 
     def __init__(self, config: TrainConfig) -> None:
         super().__init__()
-        sizes, inputs = config.network, OBSERVATION_SIZE + LATENT_SIZE
-        self.observation_norm = ObservationNorm(OBSERVATION_SIZE)
+        sizes, action_size = config.network, ROBOT_MODELS[config.env.robot.model].action_size
+        inputs = observation_size(action_size) + LATENT_SIZE
+        self.observation_norm = ObservationNorm(observation_size(action_size))
         self.actor = make_actor(
             inputs,
-            ACTION_SIZE,
+            action_size,
             hidden_sizes=sizes.actor_hidden_sizes,
             init_std=sizes.init_std,
             min_std=sizes.min_std,
@@ -90,7 +92,8 @@ class Networks(nn.Module):
             self._add_perceptual(config)
 
     def _add_perceptual(self, config: TrainConfig) -> None:
-        inputs, seen = OBSERVATION_SIZE + LATENT_SIZE, (keys.OBSERVATION, keys.LATENT)
+        seen = (keys.OBSERVATION, keys.LATENT)
+        inputs = observation_size(ROBOT_MODELS[config.env.robot.model].action_size) + LATENT_SIZE
         make = functools.partial(
             DistributionalCollisionEstimator,
             num_atoms=config.cura.num_atoms,
@@ -120,7 +123,7 @@ def _ignore_latent_(network: nn.Module) -> None:
     """Let a network start without regard to the map's code: what was learned without a map stays with one."""
     first = next(layer for layer in network.modules() if isinstance(layer, nn.Linear))
     with torch.no_grad():
-        first.weight[:, OBSERVATION_SIZE:] = 0.0
+        first.weight[:, -LATENT_SIZE:] = 0.0
 
 
 def build_advantage(config: TrainConfig, networks: Networks) -> CURAAdvantage:

@@ -248,7 +248,7 @@ def _pretrain_map(arguments: list[str]) -> None:
 
 
 def _imitate(arguments: list[str]) -> None:
-    """Warm-start the networks of every method by imitating the scripted pusher."""
+    """Warm-start the networks of a method by imitating a scripted pusher."""
     module = _import("cura_torchrl.trainers.imitate")
     config = _parse(module.ImitateConfig, "imitate", arguments)
     with _clean_stdout():

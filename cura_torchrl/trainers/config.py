@@ -11,7 +11,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from cura_torchrl.envs.config import MapConfig, PushEnvConfig, ScenarioKind, Simulator, require, require_finite
+from cura_torchrl.envs.config import (
+    MapConfig,
+    PushEnvConfig,
+    RobotConfig,
+    RobotName,
+    ScenarioKind,
+    Simulator,
+    require,
+    require_finite,
+)
 from cura_torchrl.trainers.decoding import decode, encode
 
 LoggerKind = Literal["csv", "tensorboard", "wandb"]
@@ -315,6 +324,8 @@ class EvaluateConfig:
     """Trained policy: a method whose weights are shipped."""
     policy: ScriptedKind | None = None
     """Policy without learning: a pusher that sees no obstacles, one that sees them all, or random actions."""
+    robot: RobotName = RobotConfig.model
+    """Which robot a policy without learning moves; a trained one has its own."""
     scenario: ScenarioKind = "uniform"
     """Where obstacles appear."""
     object_size: float = 0.5
@@ -339,6 +350,8 @@ class EvaluateConfig:
         require(
             len(given) == 1, "policy to evaluate", [str(value) for value in given], "one of checkpoint, method, policy"
         )
+        is_own = self.policy is not None or self.robot == RobotConfig.model
+        require(is_own, "robot", self.robot, "nothing beside checkpoint or method, whose robot is their own")
         require(0.3 <= self.object_size <= 1.2, "object_size", self.object_size, "0.3 to 1.2 m")
         require(0 <= self.max_obstacles <= 6, "max_obstacles", self.max_obstacles, "0 to 6")
         for name in ("episodes", "num_workers", "chunk"):

@@ -12,7 +12,7 @@ from cura_torchrl import keys
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
-from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
 from cura_torchrl.trainers.active_perception import Sightings
 
 if TYPE_CHECKING:
@@ -62,12 +62,12 @@ def bodies(
     Returns:
         Their (x [m], y [m], yaw [rad]), shape ``[N, 3, 3]``, and half extents [m], shape ``[N, 3, 2]``.
     """
-    chassis = base_pose.new_tensor(model.CHASSIS_SIZE) / 2
+    chassis = base_pose.new_tensor(CHASSIS_SIZE) / 2
     front = geometry.from_frame(base_pose, torch.stack([chassis[0], torch.zeros_like(chassis[0])]).expand_as(tcp))
     reach = tcp - front
     arm = torch.cat([(front + tcp) / 2, geometry.angle_of(reach)[:, None]], -1)
     length = geometry.norm(reach)
-    arm_half = torch.stack([length / 2, torch.full_like(length, scenarios.ARM_HALF_WIDTH)], -1)
+    arm_half = torch.stack([length / 2, scenarios.arm_half_width(length)], -1)
     object_half = (object_edge / 2)[:, None].expand_as(tcp)
     half = torch.stack([chassis.expand_as(tcp), arm_half, object_half], 1)
     return torch.stack([base_pose, arm, object_pose], 1), half

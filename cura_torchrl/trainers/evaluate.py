@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from tqdm import tqdm
 
 from cura_torchrl import keys
-from cura_torchrl.envs.config import PushEnvConfig
+from cura_torchrl.envs.config import PushEnvConfig, RobotConfig
 from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.envs.robots import scripted
 from cura_torchrl.trainers.checkpoint import load_policy
@@ -320,7 +320,7 @@ def _build(config: EvaluateConfig) -> tuple[EnvBase, Callable[[TensorDictBase], 
         task = evaluation_task(loaded.config.env.task, config)
         env = loaded.make_env(config.chunk, task=task, simulator=config.simulator, seed=config.seed)
         return env, loaded.policy
-    base = PushEnvConfig(simulator=config.simulator)
+    base = PushEnvConfig(simulator=config.simulator, robot=RobotConfig(model=config.robot))
     env = PushEnv(config.chunk, dataclasses.replace(base, task=evaluation_task(base.task, config)), seed=config.seed)
     if config.policy == "random":
         return env, env.rand_action
@@ -334,10 +334,11 @@ def _path(config: EvaluateConfig) -> str | Path:
 def _source(config: EvaluateConfig) -> dict[str, Any]:
     """Return who plays; raises before any world is built."""
     if config.policy is not None:
-        return {"method": config.policy, "checkpoint": None, "trained_frames": 0}
+        return {"method": config.policy, "robot": config.robot, "checkpoint": None, "trained_frames": 0}
     loaded = load_policy(_path(config))
     return {
         "method": loaded.config.method,
+        "robot": loaded.config.env.robot.model,
         "checkpoint": loaded.path.as_posix(),
         "trained_frames": loaded.record["frames"],
         "trained_commit": loaded.record["commit"],

@@ -200,7 +200,7 @@ def _fill(stage: Path, loaded: LoadedPolicy, check_steps: int) -> None:
         _write_graph(map_graph, map_signals(transform), stage / "map")
         bar.update()
         bar.set_description("policy")
-        _write_graph(policy_graph, policy_signals(transform, loaded.config.cura.num_atoms), stage / "policy")
+        _write_graph(policy_graph, policy_signals(transform, loaded.config), stage / "policy")
         bar.update()
         bar.set_description("recording")
         recording: dict[str, Any] = record(map_graph, policy_graph, loaded, check_steps)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE, OBSERVATION_SLICES
-from cura_torchrl.envs.push import ACTION_SIZE
+from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES, observation_size
+from cura_torchrl.envs.robots.robot import ROBOT_MODELS
 from cura_torchrl.trainers.build import LATENT_SIZE
 from cura_torchrl.trainers.info import git_commit, versions
 
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from cura_torchrl.envs.config import RobotConfig
     from cura_torchrl.envs.transforms import ConfidenceMap
     from cura_torchrl.trainers.checkpoint import LoadedPolicy
+    from cura_torchrl.trainers.config import TrainConfig
 
 OBSERVATION_PARTS: dict[str, tuple[str, str]] = {
     "tcp_position": ("m", "TCP relative to the base"),
@@ -72,24 +73,27 @@ def map_signals(transform: ConfidenceMap) -> tuple[list[Signal], list[Signal]]:
     return inputs, outputs
 
 
-def policy_signals(transform: ConfidenceMap, num_atoms: int) -> tuple[list[Signal], list[Signal]]:
+def policy_signals(transform: ConfidenceMap, config: TrainConfig) -> tuple[list[Signal], list[Signal]]:
     """Return the inputs and the outputs of the graph of encoder, normalisation, policy and collision estimator.
 
     Args:
         transform: The map.
-        num_atoms: Atoms of the collision estimator N [1].
+        config: Whose policy it is.
 
     Returns:
         Inputs and outputs, in order.
     """
+    size = ROBOT_MODELS[config.env.robot.model].action_size
     inputs = [
         map_signals(transform)[1][-1],
-        Signal("observation", (1, OBSERVATION_SIZE), "see observation", "base", "robot, object and goal, as measured"),
+        Signal(
+            "observation", (1, observation_size(size)), "see observation", "base", "robot, object and goal, as measured"
+        ),
     ]
     outputs = [
-        Signal("action", (1, ACTION_SIZE), "1", "base", "mean action, clamped; see action"),
+        Signal("action", (1, size), "1", "base", "mean action, clamped; see action"),
         Signal("latent", (1, LATENT_SIZE), "1", "", "code of the window"),
-        Signal("atoms", (1, num_atoms), "1", "", "atoms of the collision possibility, in no order"),
+        Signal("atoms", (1, config.cura.num_atoms), "1", "", "atoms of the collision possibility, in no order"),
         Signal("risk", (1, 1), "1", "", "mean of the atoms"),
         Signal("uncertainty", (1, 1), "1", "", "population variance of the atoms"),
     ]
@@ -109,7 +113,7 @@ def describe(loaded: LoadedPolicy, transform: ConfidenceMap) -> dict[str, Any]:
     config, task = loaded.config, loaded.config.env.task
     pairs = {
         "map": map_signals(transform),
-        "policy": policy_signals(transform, config.cura.num_atoms),
+        "policy": policy_signals(transform, config),
     }
     graphs = {
         name: {
@@ -129,7 +133,7 @@ def describe(loaded: LoadedPolicy, transform: ConfidenceMap) -> dict[str, Any]:
         "graphs": graphs,
         "initial_state": {"stamps": 0.0, "steps": float(transform.initial_state(1)[1])},
         "action": _actions(config.env.robot),
-        "observation": _observation(),
+        "observation": _observation(config.env.robot),
         "lidar": {
             "num_rays": transform.num_rays,
             "max_range": transform.max_range,
@@ -147,21 +151,24 @@ def _actions(robot: RobotConfig) -> dict[str, Any]:
         "base_yaw": (robot.max_base_yaw_rate, "rad/s"),
         **{f"tcp_{axis}": (robot.max_tcp_speed, "m/s") for axis in "xyz"},
     }
+    size = ROBOT_MODELS[robot.model].action_size
     return {
         "frame": "base",
         "low": -1.0,
         "high": 1.0,
         "meaning": "velocities as shares of scale, the end-effector's relative to the base; (base_x, base_y) is "
         "shortened to length 1",
-        "parts": [{"name": name, "scale": scale, "unit": unit} for name, (scale, unit) in speeds.items()],
+        "parts": [{"name": name, "scale": scale, "unit": unit} for name, (scale, unit) in list(speeds.items())[:size]],
     }
 
 
-def _observation() -> list[dict[str, Any]]:
-    parts = []
+def _observation(robot: RobotConfig) -> list[dict[str, Any]]:
+    parts, size = [], observation_size(ROBOT_MODELS[robot.model].action_size)
     for name, (unit, meaning) in OBSERVATION_PARTS.items():
         place = OBSERVATION_SLICES[name]
-        parts.append({"name": name, "start": place.start, "stop": place.stop, "unit": unit, "meaning": meaning})
+        parts.append(
+            {"name": name, "start": place.start, "stop": min(place.stop, size), "unit": unit, "meaning": meaning}
+        )
     return parts
 
 

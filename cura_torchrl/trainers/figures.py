@@ -12,7 +12,7 @@ from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
-from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots.ridgeback_franka import HOME_TCP
 from cura_torchrl.trainers import raster
 from cura_torchrl.trainers.moments import frames_at
 from cura_torchrl.trainers.raster import rectangle_corners
@@ -152,7 +152,7 @@ def _draw_sizes(axis: Any, config: ScenarioConfig) -> None:
     """Draw robot and largest object at their start, and an obstacle of each size."""
     edge = max(config.object_edges)
     hand = -edge / 2 - float(np.mean(config.start_gap))
-    base = (hand - model.HOME_TCP[0], 0.0, 0.0)
+    base = (hand - HOME_TCP[0], 0.0, 0.0)
     draw_robot(axis, base, (hand, 0.0))
     axis.add_patch(Polygon(rectangle_corners((0.0, 0.0, 0.0), edge, edge), facecolor=raster.OBJECT))
     write(axis, "robot", base[:2], up=-24, fontsize=9)

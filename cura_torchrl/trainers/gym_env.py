@@ -15,8 +15,6 @@ import torch
 
 from cura_torchrl import keys
 from cura_torchrl.envs.config import require
-from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE
-from cura_torchrl.envs.push import ACTION_SIZE
 from cura_torchrl.trainers.build import LATENT_SIZE, make_env
 from cura_torchrl.trainers.methods import method as preset
 
@@ -31,7 +29,7 @@ if TYPE_CHECKING:
 class PushGym(gymnasium.Env):
     """Push a box to a goal, for learners that speak Gymnasium.
 
-    The observation is the vector of :mod:`cura_torchrl.envs.mdp.observations` (33 numbers), then the code of the
+    The observation is the vector of :mod:`cura_torchrl.envs.mdp.observations` (33 numbers, without an arm 30), then the code of the
     confidence map (32). ``info`` holds ``cost`` (1 on collision), ``contact`` (base, arm, object), ``success`` (for
     each of ``TaskConfig.tolerances``), ``is_success`` (the first of them) and ``scenario`` (its index). Episodes end by
     themselves: a collision terminates, time truncates.
@@ -69,9 +67,11 @@ class PushGym(gymnasium.Env):
         self._env = make_env(config, 1)
         self._state: TensorDictBase | None = None
         self._next = 0
-        size = OBSERVATION_SIZE + LATENT_SIZE
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), dtype=np.float32)
+        (seen,), (actions,) = (
+            spec.shape[1:] for spec in (self._env.observation_spec[keys.OBSERVATION], self._env.action_spec)
+        )
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (seen + LATENT_SIZE,), dtype=np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (actions,), dtype=np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -103,7 +103,7 @@ class PushGym(gymnasium.Env):
         """Play a policy step.
 
         Args:
-            action: Base (vx, vy, wz) and end-effector (vx, vy, vz) as shares of their maxima, shape ``[6]``.
+            action: Base (vx, vy, wz) and end-effector (vx, vy, vz) as shares of their maxima, shape ``[A]``; a base without an arm has the first three alone.
 
         Returns:
             Observation, reward, whether a collision ended the episode, whether time did, and info.
@@ -114,7 +114,7 @@ class PushGym(gymnasium.Env):
         if self._state is None:
             msg = "the environment has not been reset; accepted: reset() before step()"
             raise RuntimeError(msg)
-        given = self._state.set(keys.ACTION, torch.as_tensor(action, dtype=torch.float32).reshape(1, ACTION_SIZE))
+        given = self._state.set(keys.ACTION, torch.as_tensor(action, dtype=torch.float32).reshape(1, -1))
         with torch.no_grad():
             self._state = state = self._env.step(given)["next"]
         ends = bool(state["terminated"]), bool(state["truncated"])

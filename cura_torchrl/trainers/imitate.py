@@ -4,7 +4,7 @@ Dataset aggregation (the learner drives, the expert labels) learns from little w
 ``train --init-from`` goes on from there. The expert decides what is left for PPO:
 
 - ``scripted`` pushes where there are no obstacles, what all methods have in common. The networks see neither map nor
-  obstacles, so one warm start serves every method and favours none.
+  obstacles, so one warm start serves every method of the same robot and favours none.
 - ``avoider`` steers around every obstacle, seen or not. The networks see what their method sees of it, so every method
   has a warm start of its own, made in the same way; what the map does not show, they cannot copy.
 
@@ -58,7 +58,7 @@ class ImitateConfig:
     expert: Expert = "scripted"
     """Who is imitated: a pusher without obstacles, or one that steers around all of them."""
     method: str = "push"
-    """Whose LiDAR and map the networks see, if there are obstacles."""
+    """Whose robot acts, and whose LiDAR and map the networks see, if there are obstacles."""
     perception: Perception = "map"
     """What they see beside their vector, if there are obstacles: the map's code, or for diagnosis the obstacles."""
     simulator: Simulator = "bullet"
@@ -151,8 +151,9 @@ def _rounds(env: EnvBase, networks: Networks, config: ImitateConfig) -> Iterator
     Yields:
         What the networks see and the expert's actions in a round, batch size ``[F]``.
     """
-    expert = ScriptedAvoider() if config.expert == "avoider" else ScriptedPusher()
-    carrier, noise = env.reset(), torch.zeros(config.num_envs, 6)
+    robot = env.base_env.config.robot
+    expert = ScriptedAvoider(robot) if config.expert == "avoider" else ScriptedPusher(robot)
+    carrier, noise = env.reset(), torch.zeros(env.action_spec.shape)
     for index in range(config.rounds):
         is_learner = (torch.arange(config.num_envs) % 2 == 0)[:, None] & torch.tensor(index > 0)
         kept = []

@@ -7,7 +7,7 @@ import difflib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from cura_torchrl.envs.config import MapConfig, PushEnvConfig
+from cura_torchrl.envs.config import MapConfig, PushEnvConfig, RobotName
 from cura_torchrl.trainers.config import CURAConfig, RiskMeasureKind, TrainConfig, UncertaintyKind
 
 if TYPE_CHECKING:
@@ -34,6 +34,8 @@ class Method:
     """What of the predicted distribution the risk is; its level is the default of ``CURAConfig.risk_level``."""
     uncertainty: UncertaintyKind = "total"
     """Which variance the uncertainty is."""
+    robot: RobotName = "ridgeback_franka"
+    """What pushes: the arm's hand, or a bare base's front face."""
 
 
 METHODS: dict[str, Method] = {
@@ -47,6 +49,17 @@ METHODS: dict[str, Method] = {
         label="CURA w/o Uncertainty", occlusion=True, decay=0.9, risk_coeff=0.0625, uncertainty_coeff=0.0
     ),
     "cura-no-risk": Method(label="CURA w/o Risk", occlusion=True, decay=0.9, risk_coeff=0.0, uncertainty_coeff=0.25),
+    "push-base": Method(
+        label="Push w/ Base", occlusion=True, decay=1.0, risk_coeff=0.0, uncertainty_coeff=0.0, robot="ridgeback"
+    ),
+    "cura-ppo-base": Method(
+        label="CURA-PPO w/ Base",
+        occlusion=True,
+        decay=0.9,
+        risk_coeff=0.0625,
+        uncertainty_coeff=0.25,
+        robot="ridgeback",
+    ),
 }
 """The methods by name. Both coefficients are a quarter of the paper's, for they weigh against a z-scored advantage."""
 
@@ -92,6 +105,7 @@ def method(name: str) -> TrainConfig:
         method=name,
         env=dataclasses.replace(
             env,
+            robot=dataclasses.replace(env.robot, model=preset.robot),
             lidar=dataclasses.replace(env.lidar, occlusion=preset.occlusion),
             # Resets spread out over time; in lockstep the returns oscillate with the episode's phase.
             task=dataclasses.replace(env.task, random_first_age=True, curriculum=CURRICULUM),

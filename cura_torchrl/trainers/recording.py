@@ -15,7 +15,8 @@ from cura_torchrl import keys
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
-from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
+from cura_torchrl.envs.robots.ridgeback_franka import HOME_TCP
 from cura_torchrl.modules.functional import atom_mean, atom_variance
 from cura_torchrl.trainers.episode_measures import bodies, clearance
 from cura_torchrl.trainers.evaluate import Episode, play_episodes
@@ -105,6 +106,12 @@ class Recording:
     def uncertainty(self) -> NDArray[np.float32]:
         """U, the atoms' variance [1], shape ``[T]``."""
         return atom_variance(torch.from_numpy(self.atoms)).numpy()
+
+    @cached_property
+    def has_arm(self) -> bool:
+        """Whether the TCP is a hand's, and not the centre of the chassis' front face."""
+        reach = np.hypot(*(self.tcp - self.base_pose[:, :2]).T)
+        return bool((reach > CHASSIS_SIZE[0] / 2 + scenarios.ARM_LEAST_REACH).any())
 
     @property
     def end_time(self) -> float:
@@ -242,7 +249,7 @@ def _draw(config: ScenarioConfig, seed: int, episodes: torch.Tensor) -> TensorDi
         seed=seed,
         episodes=episodes,
         max_obstacles=config.max_obstacles,
-        tcp_reach=model.HOME_TCP[0],
+        tcp_reach=HOME_TCP[0],
     )
 
 

@@ -15,7 +15,7 @@ from matplotlib.patheffects import withStroke
 from PIL import Image
 
 from cura_torchrl.envs import geometry
-from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
 from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.trainers import raster
 from cura_torchrl.trainers.raster import rectangle_corners
@@ -56,14 +56,14 @@ def draw_paths(axis: Any, recording: Recording) -> None:
             label.set_zorder(5)
     every = round(_POSE_TIME / recording.period)
     for step in range(0, len(recording.times), every):
-        robot = rectangle_corners(recording.base_pose[step], *model.CHASSIS_SIZE)
+        robot = rectangle_corners(recording.base_pose[step], *CHASSIS_SIZE)
         box = rectangle_corners(recording.object_pose[step], edge, edge)
         outline(axis, robot, raster.ROBOT, alpha=0.35, linewidth=0.8)
         outline(axis, box, raster.OBJECT, alpha=0.35, linewidth=0.8)
     axis.plot(*recording.base_pose[:, :2].T, color=raster.ROBOT, linewidth=2.0)
     axis.plot(*recording.object_pose[:, :2].T, color=raster.OBJECT, linewidth=2.0, linestyle=(0, (4, 1)))
     axis.plot(*recording.object_pose[0, :2], "o", color=raster.OBJECT, markerfacecolor="white", markersize=5)
-    draw_robot(axis, recording.base_pose[-1], recording.tcp[-1])
+    draw_robot(axis, recording.base_pose[-1], recording.tcp[-1] if recording.has_arm else None)
     axis.add_patch(Polygon(rectangle_corners(recording.object_pose[-1], edge, edge), facecolor=raster.OBJECT))
     if recording.outcome == "collision":
         bodies = (recording.base_pose, recording.tcp, recording.object_pose)
@@ -85,7 +85,7 @@ def _free_place(
             recording.base_pose[:, :2],
             recording.object_pose[:, :2],
             rectangle_corners(recording.object_pose[-1], edge, edge),
-            rectangle_corners(recording.base_pose[-1], *model.CHASSIS_SIZE),
+            rectangle_corners(recording.base_pose[-1], *CHASSIS_SIZE),
             others[np.abs(others - obstacle[:2]).max(-1) > 0.0],
             *(np.array([[x - 0.6, y], [x, y], [x + 0.6, y]]) for x, y in words),
         ]
@@ -97,15 +97,16 @@ def _free_place(
 
 
 def draw_robot(axis: Any, base: Any, tcp: Any) -> None:
-    """Draw chassis and arm, seen from above.
+    """Draw chassis and arm, if any, seen from above.
 
     Args:
         axis: Where to draw.
         base: (x [m], y [m], yaw [rad]).
-        tcp: TCP in the plane [m].
+        tcp: TCP in the plane [m]; None draws no arm.
     """
-    axis.add_patch(Polygon(rectangle_corners(base, *model.CHASSIS_SIZE), facecolor=raster.ROBOT))
-    axis.plot([base[0], tcp[0]], [base[1], tcp[1]], color=raster.ARM, linewidth=3.0, solid_capstyle="round")
+    axis.add_patch(Polygon(rectangle_corners(base, *CHASSIS_SIZE), facecolor=raster.ROBOT))
+    if tcp is not None:
+        axis.plot([base[0], tcp[0]], [base[1], tcp[1]], color=raster.ARM, linewidth=3.0, solid_capstyle="round")
 
 
 def draw_map(axis: Any, recording: Recording, frame: int, *, channel: int) -> None:
@@ -129,7 +130,7 @@ def draw_map(axis: Any, recording: Recording, frame: int, *, channel: int) -> No
         interpolation="nearest",
     )
     edge, step = recording.scene.object_edge, int(recording.frame_steps[frame])
-    outline(axis, rectangle_corners((0.0, 0.0, 0.0), *model.CHASSIS_SIZE), raster.ROBOT, linewidth=1.6)
+    outline(axis, rectangle_corners((0.0, 0.0, 0.0), *CHASSIS_SIZE), raster.ROBOT, linewidth=1.6)
     outline(axis, rectangle_corners(recording.object_in_base(step), edge, edge), raster.OBJECT, linewidth=1.6)
     axis.set(xticks=_MAP_TICKS, yticks=_MAP_TICKS, xlim=(-extent, extent), ylim=(-extent, extent))
     axis.tick_params(labelsize=8)

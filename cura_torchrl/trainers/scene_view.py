@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw
 
-from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots import ridgeback, ridgeback_franka
 from cura_torchrl.envs.simulation.camera import Camera, View
 from cura_torchrl.trainers import raster
 from cura_torchrl.trainers.animation import (
@@ -71,7 +71,7 @@ def make_camera(recording: Recording, size: tuple[int, int]) -> Camera:
         The camera, to be closed.
     """
     return Camera(
-        model.URDF,
+        (ridgeback_franka if recording.has_arm else ridgeback).URDF,
         object_edge=recording.scene.object_edge,
         obstacle_edges=recording.obstacles[-1, :, 3].tolist(),
         size=size,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
 from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.trainers import raster
 from cura_torchrl.trainers.animation import map_image
@@ -117,11 +117,12 @@ class View:
             passed: Time of the scene that passed before the recording [s].
         """
         base, tcp, edge = recording.base_pose[step], recording.tcp[step], recording.scene.object_edge
-        self._box("robot/chassis", base, (*model.CHASSIS_SIZE, _HEIGHT), raster.ROBOT)
+        self._box("robot/chassis", base, (*CHASSIS_SIZE, _HEIGHT), raster.ROBOT)
         reach = tcp - base[:2]
         middle = (*(base[:2] + reach / 2), np.arctan2(reach[1], reach[0]))
         arm = (float(np.hypot(*reach)), _ARM_WIDTH, _ARM_WIDTH)
-        self._box("robot/arm", middle, arm, raster.ARM, above=_HEIGHT)
+        if recording.has_arm:
+            self._box("robot/arm", middle, arm, raster.ARM, above=_HEIGHT)
         self._box("object", recording.object_pose[step], (edge, edge, edge), raster.OBJECT)
         self._box("goal", recording.scene.goal_pose, (edge, edge, 0.01), raster.GOAL)
         for number, obstacle in enumerate(recording.obstacles[step]):

@@ -138,6 +138,7 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
         (["export"], "policy to export is []; accepted: one of checkpoint, method"),
         (["export", "--method", "cura"], "method is 'cura'"),
         (["export", "--method", "push", "--out", "/"], "out is '/'; accepted: a folder that is empty or not there"),
+        (["evaluate", "--method", "push", "--robot", "ridgeback"], "robot is 'ridgeback'; accepted: nothing beside"),
         (["table", "--methods", "push,cura"], "method is 'cura'; accepted: cura-no-risk, "),
         (["table", "--cells", "uniform-0.5", "uniform-9"], "cell is 'uniform-9'; accepted: all, or SCENARIO-SIZE"),
         (["table", "--methods", "push", "--seeds", "7", "--runs", "{tmp}", "--out", "{tmp}"], "no checkpoint at"),

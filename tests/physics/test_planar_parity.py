@@ -7,17 +7,20 @@ import dataclasses
 import pytest
 import torch
 
-from cura_torchrl.envs.config import LidarConfig, PushEnvConfig, ScenarioConfig, TaskConfig
+from cura_torchrl.envs.config import LidarConfig, PushEnvConfig, RobotConfig, ScenarioConfig, TaskConfig
 from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.envs.robots.scripted import ScriptedPusher
 
 SIMULATORS = ("bullet", "planar")
 
 
-def make_envs(rows: int, **scenario: object) -> list[PushEnv]:
+ARM, BARE = RobotConfig(), RobotConfig(model="ridgeback")
+
+
+def make_envs(rows: int, robot: RobotConfig = ARM, **scenario: object) -> list[PushEnv]:
     """Return one environment a simulator, of the same scenes and without noise on the scan."""
     task = TaskConfig(scenario=ScenarioConfig(**({"obstacle_time": (0.0, 0.0)} | scenario)))
-    config = PushEnvConfig(task=task, lidar=LidarConfig(noise=0.0))
+    config = PushEnvConfig(task=task, lidar=LidarConfig(noise=0.0), robot=robot)
     return [PushEnv(rows, dataclasses.replace(config, simulator=name), seed=3) for name in SIMULATORS]
 
 
@@ -45,10 +48,11 @@ def test_the_robot_moves_alike_when_it_touches_nothing():
     assert hand.median() < 0.02
 
 
-def test_boxes_go_where_pybullet_pushes_them():
+@pytest.mark.parametrize("robot", [ARM, BARE], ids=["arm", "base"])
+def test_boxes_go_where_pybullet_pushes_them(robot: RobotConfig):
     """Catches friction, inertia or contact of another kind. Threshold: the median within 2 cm after 2 s of contact."""
-    bullet, planar = make_envs(9, max_obstacles=0, start_gap=(0.2, 0.25))
-    policy, actions = ScriptedPusher(), []
+    bullet, planar = make_envs(9, robot, max_obstacles=0, start_gap=(0.2, 0.25))
+    policy, actions = ScriptedPusher(robot), []
     data = bullet.reset()
     for _ in range(14):
         data = policy(data)

@@ -12,8 +12,9 @@ import pybullet_data
 import pytest
 import torch
 
+from cura_torchrl.envs.robots import ridgeback
 from cura_torchrl.envs.robots import ridgeback_franka as model
-from cura_torchrl.envs.robots.dynamics import RobotDynamics
+from cura_torchrl.envs.robots.dynamics import BaseDynamics, RobotDynamics
 from cura_torchrl.envs.robots.kinematics import ArmKinematics
 from tests.worlds import make_worlds
 
@@ -89,11 +90,11 @@ def test_the_gripper_is_open():
 def test_the_base_has_the_ridgebacks_dimensions():
     """Catches a chassis, mount or scan plane that is not where the data sheet and the task put it."""
     box = find(OURS, "link", "base_link").find("collision").find("geometry").find("box")
-    assert numbers(box, "size")[:2] == list(model.CHASSIS_SIZE) == [0.960, 0.793]
-    assert numbers(find(OURS, "joint", "base_yaw").find("origin"), "xyz") == [0.0, 0.0, model.BASE_LINK_HEIGHT]
+    assert numbers(box, "size")[:2] == list(ridgeback.CHASSIS_SIZE) == [0.960, 0.793]
+    assert numbers(find(OURS, "joint", "base_yaw").find("origin"), "xyz") == [0.0, 0.0, ridgeback.BASE_LINK_HEIGHT]
     assert numbers(find(OURS, "joint", "arm_mount").find("origin"), "xyz") == [0.21, 0.0, 0.28]
     lidar = numbers(find(OURS, "joint", "lidar_mount").find("origin"), "xyz")
-    assert lidar == pytest.approx([0.0, 0.0, 0.26 - model.BASE_LINK_HEIGHT])
+    assert lidar == pytest.approx([0.0, 0.0, 0.26 - ridgeback.BASE_LINK_HEIGHT])
 
 
 @pytest.fixture(scope="module")
@@ -184,3 +185,31 @@ def test_the_inertia_is_that_of_pybullet():
     pybullet.disconnect(client)
     matrix = RobotDynamics().mass_matrix(torch.from_numpy(position))
     np.testing.assert_allclose(matrix, expected, atol=1e-5)
+
+
+def test_the_bare_base_is_the_one_that_carries_the_arm():
+    """Catches a base of other dimensions, masses or joints, and a part of the arm that was left on it."""
+
+    def parts(root: ET.Element) -> dict[tuple[str, str], str]:
+        kinds = [element for element in root if element.tag in {"link", "joint"}]
+        return {(part.tag, part.attrib["name"]): ET.canonicalize(ET.tostring(part), strip_text=True) for part in kinds}
+
+    bare, carrying = parts(ET.parse(ridgeback.URDF).getroot()), parts(OURS)
+    assert bare == {name: part for name, part in carrying.items() if name in bare}
+    links = {"world", "base_slide_x", "base_slide_y", "base_link", "lidar"}
+    assert {name for kind, name in bare if kind == "link"} == links
+    assert {name for kind, name in bare if kind == "joint"} == {*ridgeback.BASE_JOINTS, "lidar_mount"}
+
+
+def test_the_bare_base_has_the_inertia_of_pybullet():
+    """Catches a servo with the arm's mass, and a mass matrix that turns with the base."""
+    client = pybullet.connect(pybullet.DIRECT)
+    flags = pybullet.URDF_USE_INERTIA_FROM_FILE
+    robot = pybullet.loadURDF(str(ridgeback.URDF), useFixedBase=True, flags=flags, physicsClientId=client)
+    position = np.array([[0.0, 0.0, 0.0], [1.0, -2.0, 0.7]])
+    expected = [pybullet.calculateMassMatrix(robot, row.tolist(), physicsClientId=client) for row in position]
+    pybullet.disconnect(client)
+    matrix = BaseDynamics().mass_matrix(torch.from_numpy(position))
+    np.testing.assert_allclose(matrix, expected, atol=1e-5)
+    assert matrix[0, 0, 0].item() == pytest.approx(ridgeback.BASE_MASS, abs=0.01)
+    assert matrix[0, 2, 2].item() == pytest.approx(ridgeback.BASE_YAW_INERTIA, abs=1e-3)

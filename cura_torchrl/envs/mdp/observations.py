@@ -27,8 +27,9 @@ OBSERVATION_SLICES: dict[str, slice] = {
 """Where each part of the observation lies; all in the base frame.
 
 ========================  =============================================================================
-``tcp_position``          TCP relative to the base [m]
-``hand_axes``             x axis, then y axis, of the hand: the first two columns of its rotation matrix [1]
+``tcp_position``          TCP relative to the base [m]; without an arm the TCP is the front face's centre
+``hand_axes``             x axis, then y axis, of the hand: the first two columns of its rotation matrix [1]; without
+                          an arm those of the base
 ``tcp_velocity``          velocity of the TCP relative to the world [m/s]
 ``base_velocity``         base's (x [m/s], y [m/s], yaw rate [rad/s])
 ``object_position``       object's centre, its height included, which tells the edge [m]
@@ -43,6 +44,22 @@ OBSERVATION_SLICES: dict[str, slice] = {
 
 OBSERVATION_SIZE: int = sum(_SIZES.values())
 """Length of the observation for a 6-dimensional action [1]."""
+
+
+def observation_size(action_size: int) -> int:
+    """Return the length of the observation.
+
+    Args:
+        action_size: Numbers of an action [1].
+
+    Returns:
+        Numbers of an observation [1].
+
+    Examples:
+        >>> observation_size(6) == OBSERVATION_SIZE, observation_size(3)
+        (True, 30)
+    """
+    return OBSERVATION_SIZE - _SIZES["previous_action"] + action_size
 
 
 def _heading(yaw: torch.Tensor) -> torch.Tensor:
@@ -79,7 +96,7 @@ def observe(  # noqa: PLR0913 - one argument per measured quantity
         goal_pose: Goal's (x [m], y [m], yaw [rad]) in the world, shape ``[N, 3]``.
 
     Returns:
-        Observations, float32, shape ``[N, D]``; D is :data:`OBSERVATION_SIZE` when A is 6.
+        Observations, float32, shape ``[N, D]``; D is :func:`observation_size` of A.
 
     Source:
         Paper, Section "Observation space": o_p, o_o, p_g.

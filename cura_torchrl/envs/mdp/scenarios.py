@@ -29,6 +29,9 @@ CHASSIS_HALF = (0.480, 0.3965)
 ARM_HALF_WIDTH = 0.15
 """Half width of the strip from the chassis' front to the TCP that stands for the arm seen from above [m]."""
 
+ARM_LEAST_REACH = 1e-3
+"""A TCP nearer to the chassis' front than this is the front's own: there is no arm [m]."""
+
 CHASSIS_START_GAP = 0.1
 """Least distance of the chassis from the plane of the object's rear face at the start [m]."""
 
@@ -233,9 +236,21 @@ def _surfaces(
     arm = tcp_position - front
     arm_pose = torch.cat(((front + tcp_position) / 2, geometry.angle_of(arm).unsqueeze(-1)), -1)
     arm_length = geometry.norm(arm)
-    arm_half = torch.stack((arm_length / 2, torch.full_like(arm_length, ARM_HALF_WIDTH)), -1)
+    arm_half = torch.stack((arm_length / 2, arm_half_width(arm_length)), -1)
     object_half = (object_edge / 2).unsqueeze(-1).expand(-1, 2)
     return torch.stack((base_pose, arm_pose, object_pose), -2), torch.stack((chassis_half, arm_half, object_half), -2)
+
+
+def arm_half_width(reach: torch.Tensor) -> torch.Tensor:
+    """Return half the width of the strip that stands for the arm, 0 where there is none.
+
+    Args:
+        reach: Distance from the chassis' front to the TCP [m], shape ``[*]``.
+
+    Returns:
+        Half widths [m], shape ``[*]``.
+    """
+    return torch.where(reach < ARM_LEAST_REACH, 0.0, torch.full_like(reach, ARM_HALF_WIDTH))
 
 
 def _clearance(

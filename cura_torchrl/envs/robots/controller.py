@@ -10,22 +10,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.robots import ridgeback_franka as model
+from cura_torchrl.envs.robots.base_controller import BaseController
 from cura_torchrl.envs.robots.ik_kernel import Follow, rates_of_one
 from cura_torchrl.envs.robots.kinematics import ArmKinematics, damped_least_squares
-from cura_torchrl.envs.robots.ridgeback_franka import BASE_DOF, DOF
-from cura_torchrl.envs.robots.torque_kernel import torques_of_one
+from cura_torchrl.envs.robots.ridgeback import BASE_DOF
 from cura_torchrl.envs.simulation.interface import HandLinearization
 
 if TYPE_CHECKING:
     from cura_torchrl.envs.config import RobotConfig
 
 
-class ImpedanceController:
+class ImpedanceController(BaseController):
     """Joint references and torques of N robots. State: base velocity command and joint reference of each.
 
     Args:
@@ -35,61 +34,45 @@ class ImpedanceController:
         device: Where the tensors live; the CPU when None.
     """
 
-    def __init__(
-        self,
-        num_worlds: int,
-        robot: RobotConfig,
-        period: float,
-        device: torch.device | None = None,
-    ) -> None:
-        self.config = robot
-        self.kinematics = ArmKinematics(device)
-        self.period = period
-        self.ik_ticks = max(1, round(1.0 / (robot.ik_rate * self.period)))
+    inertia = (model.BASE_MASS, model.BASE_MASS, model.BASE_YAW_INERTIA)
+    kinematics: ArmKinematics
 
-        def tensor(values: Any) -> torch.Tensor:
-            return torch.as_tensor(values, dtype=torch.float64, device=device)
-
-        self._postures = tensor([model.HOME, model.VELOCITY_LIMIT])
+    def __init__(self, num_worlds: int, robot: RobotConfig, period: float, device: torch.device | None = None) -> None:
+        super().__init__(num_worlds, robot, period, device)
+        self._postures = self._tensor([model.HOME, model.VELOCITY_LIMIT])
         self._home, self._speed = self._postures
-        mass = (model.BASE_MASS, model.BASE_MASS, model.BASE_YAW_INERTIA)
-        ramp = [period * robot.max_base_acceleration] * 2 + [period * robot.max_base_yaw_acceleration]
-        unused = [0.0] * BASE_DOF
-        # One array, as each more costs the compiled law a tenth of a microsecond a tick; columns are joints.
-        self._constants = tensor(
-            [
-                [*unused, *robot.stiffness],
-                [*(m / robot.base_time_constant for m in mass), *robot.damping],
-                [*unused, *model.TORQUE_LIMIT],
-                [*unused, *model.JOINT_LOWER],
-                [*unused, *model.JOINT_UPPER],
-                [*ramp, *[0.0] * len(model.ARM_JOINTS)],
-            ]
-        )
         stiffness, damping, limit = self._constants[:3, BASE_DOF:]
         # The spring, less what the damper takes, may ask for no more than the joint has: else the reference runs away.
         self._reach, self._lag = limit / stiffness, damping / stiffness
-        self._speed_bound = robot.max_base_speed**2 * (1.0 + 1e-9)  # the margin is for rounding
-        workspace = tensor([robot.workspace_x, robot.workspace_y, robot.workspace_z]).expand(num_worlds, 3, 2)
-        self._workspace = workspace.clone()
-        self.tcp_reference = tensor(model.HOME_TCP).expand(num_worlds, 3).clone()
+        workspace = [robot.workspace_x, robot.workspace_y, robot.workspace_z]
+        self._workspace = self._tensor(workspace).expand(num_worlds, 3, 2).clone()
+        self.tcp_reference = self._tensor(model.HOME_TCP).expand(num_worlds, 3).clone()
         # What the hand is to do: the TCP's velocity, and the object's centre in the base frame.
-        self._aims = tensor([[0.0, 0.0, 0.0, 2.0, 0.0]] * num_worlds)
+        self._aims = self._tensor([[0.0, 0.0, 0.0, 2.0, 0.0]] * num_worlds)
         self._tcp_target, self._object_xy_b = self._aims[:, :3], self._aims[:, 3:]
-        # The base's velocity command and the arm's reference; then where the base heads, and the reference's rate.
-        self._motion = tensor([[[0.0] * BASE_DOF + list(model.HOME), [0.0] * DOF]] * num_worlds)
-        self.base_command, self.reference = self._motion[:, 0, :BASE_DOF], self._motion[:, 0, BASE_DOF:]
-        self._base_target, self._rate = self._motion[:, 1, :BASE_DOF], self._motion[:, 1, BASE_DOF:]
-        self._gain = self._motion.new_zeros(num_worlds, DOF, DOF)
+        self.reference, self._rate = self._motion[:, 0, BASE_DOF:], self._motion[:, 1, BASE_DOF:]
+        self.reference[...] = self._home
         self.hand = HandLinearization(*self.kinematics.forward(self._home[None]), reference=self._home[None])
         if self._motion.device.type == "cpu":
             self._compile(robot)
 
+    def _make_kinematics(self) -> ArmKinematics:
+        return ArmKinematics(self._device)
+
+    def _columns(self, robot: RobotConfig) -> list[list[float]]:
+        arm = (
+            robot.stiffness,
+            robot.damping,
+            model.TORQUE_LIMIT,
+            model.JOINT_LOWER,
+            model.JOINT_UPPER,
+            [0.0] * len(model.ARM_JOINTS),
+        )
+        # One array, as each more costs the compiled law a tenth of a microsecond a tick.
+        return [[*base, *joints] for base, joints in zip(super()._columns(robot), arm, strict=True)]
+
     def _compile(self, robot: RobotConfig) -> None:
-        """Gather what the compiled forms work on: the tensors' memory as arrays."""
-        self._torque = np.zeros(DOF)
-        for_tick = (part.numpy() for part in (self._motion, self._gain, self._constants))
-        self._tick_parts: tuple[Any, ...] = (*for_tick, self.period, self._speed_bound, self._torque)
+        """Gather what the compiled inverse kinematics works on: the tensors' memory as arrays."""
         hand = (self.tcp_reference, self._aims, self._workspace)
         for_ik = (self._motion, *hand, self.kinematics.offsets, self._postures)
         names = [name for name in Follow._fields if name != "horizon"]
@@ -120,17 +103,10 @@ class ImpedanceController:
             object_xy_b: Object's centre in the base frame, which the hand turns to [m], shape ``[N, 2]``.
             mass_matrix: Joint-space inertia, kept for the policy step [kg, kg m^2], shape ``[N, 10, 10]``.
         """
-        config = self.config
         shares = action.double().clamp(-1.0, 1.0)
-        planar = shares[:, :2] / geometry.norm(shares[:, :2]).clamp_min(1.0)[:, None] * config.max_base_speed
-        turn = shares[:, 2:3] * config.max_base_yaw_rate
-        self._base_target[...] = torch.cat([planar, turn], dim=-1)
-        self._tcp_target[...] = shares[:, 3:6] * config.max_tcp_speed
+        self._command_base(shares, mass_matrix)
+        self._tcp_target[...] = shares[:, 3:6] * self.config.max_tcp_speed
         self._object_xy_b[...] = object_xy_b
-        # tau = M (M + D dt + K dt^2)^-1 (...): the implicit (stable) form of the impedance law.
-        stiffness, damping = self._constants[:2]
-        implicit = mass_matrix + torch.diag(damping * self.period + stiffness * self.period**2)
-        self._gain[...] = mass_matrix @ torch.linalg.inv_ex(implicit).inverse
 
     def torques(self, position: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
         """Return the joint torques of one tick; :meth:`solve_ik` sets where the robots head.
@@ -152,44 +128,13 @@ class ImpedanceController:
         reference = torch.maximum(torch.maximum(reference, lower), centre - reach)
         reference = torch.minimum(torch.minimum(reference, upper), centre + reach)
         self.reference[...] = reference
-        self.base_command += self._ramp_step(self.base_command, self._base_target)
-        base_force = self._constants[1, :BASE_DOF] * (
-            self._to_world(self.base_command, position[:, 2]) - velocity[:, :BASE_DOF]
-        )
+        base_force = self._base_force(position, velocity)
         error = reference - arm_position - self.period * arm_velocity
         force = torch.cat([base_force, stiffness * error - damping * arm_velocity], dim=-1)
         torque = geometry.matvec(self._gain, force)
         arm = torque[:, BASE_DOF:]
         torch.minimum(torch.maximum(arm, -limit, out=arm), limit, out=arm)
         return torque
-
-    def torques_of(self, world: int, joints: np.ndarray) -> list[float]:
-        """Return what :meth:`torques` does, for one robot on the CPU: quicker than operations on a batch of one.
-
-        Args:
-            world: Which robot.
-            joints: Its joints' positions, then velocities, shape ``[2, 10]``.
-
-        Returns:
-            Forces and torques [N, N, N m, N m ...], one a joint.
-        """
-        torques_of_one(world, joints, *self._tick_parts)
-        torque: list[float] = self._torque.tolist()
-        return torque
-
-    def _ramp_step(self, command: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """Return the change of the base's velocity command in one tick, within the acceleration of each axis."""
-        limit, ramp = self._constants[5, :BASE_DOF], target - command
-        step = torch.minimum(torch.maximum(ramp, -limit), limit)
-        after = command[:, :2] + step[:, :2]
-        is_fast = after[:, 0] ** 2 + after[:, 1] ** 2 > self._speed_bound
-        # Axis by axis the way between two points of the disc of speeds may lead out of it; straight it cannot.
-        slowest = (ramp[:, :2].abs() / limit[:2]).amax(1, keepdim=True).clamp_min(1.0)
-        step[:, :2] = torch.where(is_fast[:, None], ramp[:, :2] / slowest, step[:, :2])
-        return step
-
-    def _to_world(self, twist: torch.Tensor, yaw: torch.Tensor) -> torch.Tensor:
-        return torch.cat([geometry.rotate(twist[:, :2], yaw), twist[:, 2:]], dim=-1)
 
     def solve_ik(self) -> None:
         """Set the rate of every joint reference from the commanded twist; due every ``ik_ticks`` ticks."""

@@ -1,4 +1,4 @@
-"""Joint-space inertia of the robot, batched over worlds, from the masses in its URDF."""
+"""Joint-space inertia of the robots, batched over worlds, from the masses in their URDFs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import pytorch_kinematics as pk
 import torch
 
 from cura_torchrl.envs.robots.kinematics import ArmKinematics
-from cura_torchrl.envs.robots.ridgeback_franka import ARM_LINKS, BASE_LINK, BASE_LINK_HEIGHT, URDF
+from cura_torchrl.envs.robots.ridgeback import BASE_LINK, BASE_LINK_HEIGHT
+from cura_torchrl.envs.robots.ridgeback import URDF as BASE_URDF
+from cura_torchrl.envs.robots.ridgeback_franka import ARM_LINKS, URDF
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,7 @@ class RobotDynamics:
             return _Inertia(*(torch.stack(column).to(device) for column in columns))
 
         self._arm, self._base = stack(ARM_LINKS), stack((BASE_LINK,))
-        slides = [masses[name].mass.item() for name in ("base_slide_x", "base_slide_y")]
-        self._slides = torch.tensor([sum(slides), slides[1]], dtype=torch.float64, device=device)
+        self._slides = _slides(masses).to(device)
         # Twists (angular, linear at the base's origin) of the base's x, y and yaw, in the base frame.
         self._base_twists = torch.eye(6, dtype=torch.float64, device=device)[[3, 4, 2]]
 
@@ -110,6 +111,42 @@ class RobotDynamics:
         matrix[:, :, :2] = matrix[:, :, :2] @ turn
         matrix.diagonal(dim1=1, dim2=2)[:, :2] += self._slides
         return matrix
+
+
+class BaseDynamics:
+    """Mass matrix of a base without an arm, whose centre of mass lies above the axis of its yaw.
+
+    Args:
+        device: Where the tensors live; the CPU when None.
+
+    Examples:
+        >>> matrix = BaseDynamics().mass_matrix(torch.zeros(2, 3, dtype=torch.float64))
+        >>> [round(entry, 3) for entry in matrix[0].diagonal().tolist()]
+        [135.2, 135.1, 17.443]
+    """
+
+    def __init__(self, device: torch.device | None = None) -> None:
+        masses = _rigid_groups(ElementTree.fromstring(BASE_URDF.read_bytes()))
+        base = masses[BASE_LINK]
+        moved = torch.cat([base.mass + _slides(masses), base.tensor[2, 2, None]])
+        self._matrix = torch.diag(moved).to(device)
+
+    def mass_matrix(self, joint_position: torch.Tensor) -> torch.Tensor:
+        """Return the joint-space inertia, the same for every pose.
+
+        Args:
+            joint_position: Base (x [m], y [m], yaw [rad]), float64, shape ``[N, 3]``.
+
+        Returns:
+            Inertia [kg, kg m^2], shape ``[N, 3, 3]``.
+        """
+        return self._matrix.expand(len(joint_position), 3, 3)
+
+
+def _slides(masses: dict[str, _Inertia]) -> torch.Tensor:
+    """Return what the base's x and y joints carry beside the base [kg], shape ``[2]``."""
+    slides = [masses[name].mass.item() for name in ("base_slide_x", "base_slide_y")]
+    return torch.tensor([sum(slides), slides[1]], dtype=torch.float64)
 
 
 def _from_the_tip(values: torch.Tensor) -> torch.Tensor:
@@ -158,6 +195,6 @@ def _origin(element: ElementTree.Element) -> tuple[torch.Tensor, torch.Tensor]:
 def _find(element: ElementTree.Element, path: str) -> ElementTree.Element:
     found = element.find(path)
     if found is None:
-        msg = f"{URDF.name} has a {element.tag} {element.attrib.get('name')} without {path}"
+        msg = f"the robot's model has a {element.tag} {element.attrib.get('name')} without {path}"
         raise ValueError(msg)
     return found

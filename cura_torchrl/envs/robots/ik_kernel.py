@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cura_torchrl.compiled import Doubles, compiled
-from cura_torchrl.envs.robots.ridgeback_franka import ARM_DOF, BASE_DOF
+from cura_torchrl.envs.robots.ridgeback import BASE_DOF
+from cura_torchrl.envs.robots.ridgeback_franka import ARM_DOF
 
 
 class Follow(NamedTuple):

@@ -11,7 +11,8 @@ import torch
 
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.robots.ik_kernel import place_hands, place_links
-from cura_torchrl.envs.robots.ridgeback_franka import ARM_LINKS, BASE_LINK, BASE_LINK_HEIGHT, TCP_LINK, URDF
+from cura_torchrl.envs.robots.ridgeback import BASE_LINK, BASE_LINK_HEIGHT
+from cura_torchrl.envs.robots.ridgeback_franka import ARM_LINKS, TCP_LINK, URDF
 
 
 class ArmKinematics:

@@ -12,22 +12,14 @@ from cura_torchrl.envs import geometry
 from cura_torchrl.envs.config import RobotConfig
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.robots import route
+from cura_torchrl.envs.robots.pushing_skills import CHASSIS_RADIUS, SKILLS, PushingSkill, Situation
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
 
 
-_CHASSIS_RADIUS = 0.6
-"""Radius of a disc that all but the corners of the chassis lie in [m]."""
-
 _BODY_CLEARANCE = 0.08
 """Distance that the avoider's discs keep from obstacles [m]."""
-
-_NEAR = 0.1
-"""Gap between hand and face below which they count as touching [m]."""
-
-_RUDDER = 2.0
-"""Rate at which the line from hand to object is turned towards the goal, per angle [1/s]."""
 
 
 class ScriptedPusher(TensorDictModuleBase):
@@ -36,7 +28,7 @@ class ScriptedPusher(TensorDictModuleBase):
     Reads ``observation``, writes ``action``; usable wherever a policy is. It looks only at robot, object and goal.
 
     Args:
-        robot: Limits that actions are shares of.
+        robot: Which robot pushes, and limits that actions are shares of.
         speed: Pushing speed [m/s].
 
     Examples:
@@ -52,6 +44,7 @@ class ScriptedPusher(TensorDictModuleBase):
         self.out_keys = [keys.ACTION]
         self.robot = RobotConfig() if robot is None else robot
         self.speed = speed
+        self._skill: PushingSkill = SKILLS[self.robot.model](self.robot)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action for every row.
@@ -72,43 +65,27 @@ class ScriptedPusher(TensorDictModuleBase):
         return parts["goal_position"]
 
     def _action(self, parts: dict[str, torch.Tensor], waypoint: torch.Tensor) -> torch.Tensor:
-        tcp, centre = parts["tcp_position"][..., :2], parts["object_position"][..., :2]
-        half = parts["object_position"][..., 2:]
+        centre, half = parts["object_position"][..., :2], parts["object_position"][..., 2:]
         to_goal = waypoint - centre
         distance = to_goal.norm(dim=-1, keepdim=True)
-        along = to_goal / distance.clamp_min(1e-6)
-        offset = centre - tcp
-        reach = offset.norm(dim=-1, keepdim=True)
-        ahead, aside = _components(offset, along)
-        gap = reach - _face_distance(offset, parts["object_heading"], half)
-        # Behind the object the hand pushes; beside it, it comes round. Once it is off the object it has to be well
-        # behind: else it would meet the same face at the same place again.
-        behind = (ahead > 0.0) & (aside.abs() < torch.where(gap > _NEAR, 0.35, 0.7) * half)
-        speed = torch.minimum(torch.full_like(distance, self.speed), 0.12 + 1.2 * distance)
-        direction = offset / reach.clamp_min(1e-6)
-        push = _push(direction, reach, torch.atan2(aside, ahead), gap, speed)
-        velocity = torch.where(behind, push, _come_round(direction, along, ahead, aside, gap, half))
+        at = Situation(
+            tcp=parts["tcp_position"][..., :2],
+            centre=centre,
+            heading=parts["object_heading"],
+            half=half,
+            distance=distance,
+            along=to_goal / distance.clamp_min(1e-6),
+            top_speed=self.speed,
+        )
+        velocity = self._skill.velocity(at)
         velocity = torch.where(distance < 0.03, torch.zeros_like(velocity), velocity)
         # Half a diagonal: whichever way the object is turned.
         velocity = self._keep_clear(centre, 1.42 * half[..., 0], velocity)
-        return self._share(tcp, velocity, geometry.angle_of(along)[..., None])
+        return self._skill.share(at, velocity, self._keep_clear)
 
     def _keep_clear(self, centre: torch.Tensor, radius: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:  # noqa: ARG002
         """Return the velocity of a disc, base frame [m/s], less what would bring it into an obstacle."""
         return velocity
-
-    def _share(self, tcp: torch.Tensor, velocity: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
-        """Return the action for a TCP velocity: the base carries it, the arm returns to its middle."""
-        spin = (1.2 * turn).clamp(-0.6, 0.6)
-        home = tcp.new_tensor([0.9, 0.0])
-        arm = (1.0 * (home - tcp)).clamp(-0.2, 0.2)
-        carried = torch.cat([-spin * tcp[..., 1:], spin * tcp[..., :1]], dim=-1)
-        base = velocity - carried - arm
-        base = self._keep_clear(torch.zeros_like(tcp), torch.full_like(turn[..., 0], _CHASSIS_RADIUS), base)
-        base = base / self.robot.max_base_speed
-        base = base / base.norm(dim=-1, keepdim=True).clamp_min(1.0)
-        lift = torch.zeros_like(turn)
-        return torch.cat([base, spin / self.robot.max_base_yaw_rate, arm / self.robot.max_tcp_speed, lift], dim=-1)
 
 
 class ScriptedAvoider(ScriptedPusher):
@@ -117,7 +94,7 @@ class ScriptedAvoider(ScriptedPusher):
     Needs an environment with ``TaskConfig.privileged``. Routes are kept until an obstacle appears or the goal changes.
 
     Args:
-        robot: Limits that actions are shares of.
+        robot: Which robot pushes, and limits that actions are shares of.
         speed: Pushing speed [m/s].
         margin: Distance that a route keeps between an obstacle and the wider of the object's inscribed circle and the
             chassis, which follows and cuts corners [m].
@@ -139,7 +116,7 @@ class ScriptedAvoider(ScriptedPusher):
         base = tensordict[keys.SENSOR_POSE]
         goal = geometry.from_frame(base, parts["goal_position"])
         centre = geometry.from_frame(base, parts["object_position"][..., :2])
-        radius = parts["object_position"][..., 2].clamp_min(_CHASSIS_RADIUS) + self.margin
+        radius = parts["object_position"][..., 2].clamp_min(CHASSIS_RADIUS) + self.margin
         self._plan(tensordict[keys.OBSTACLES], goal, radius)
         self._obstacles_b = _in_base_frame(base, tensordict[keys.OBSTACLES])
         cells = round(self.look_ahead / route.CELL)
@@ -178,53 +155,3 @@ class ScriptedAvoider(ScriptedPusher):
 def _in_base_frame(base: torch.Tensor, obstacles: torch.Tensor) -> torch.Tensor:
     position = geometry.to_frame(base[:, None].expand(-1, obstacles.shape[1], -1), obstacles[..., :2])
     return torch.cat([position, obstacles[..., 2:3] - base[:, None, 2:], obstacles[..., 3:]], dim=-1)
-
-
-def _push(
-    direction: torch.Tensor, reach: torch.Tensor, error: torch.Tensor, gap: torch.Tensor, speed: torch.Tensor
-) -> torch.Tensor:
-    """Return the hand's velocity behind the object.
-
-    The hand sticks to the face, so the object follows the line from the hand through its centre, and turns with what
-    the hand moves across that line. So the line is turned towards the goal as by a rudder.
-    """
-    forward = speed * error.cos().clamp_min(0.3)
-    forward = torch.where(gap > _NEAR, torch.minimum(forward, 0.2 + gap), forward)
-    rudder = (_RUDDER * reach * error).clamp(-0.4, 0.4)
-    return forward * direction + rudder * _left(direction)
-
-
-def _come_round(
-    direction: torch.Tensor,
-    along: torch.Tensor,
-    ahead: torch.Tensor,
-    aside: torch.Tensor,
-    gap: torch.Tensor,
-    half: torch.Tensor,
-) -> torch.Tensor:
-    """Return the hand's velocity beside the object: off it first, for it would drag it along, then behind it."""
-    retreat = (1.5 * (ahead - 1.25 * half - 0.1)).clamp(-0.6, 0.3)
-    round_it = retreat * along + (4.0 * aside).clamp(-0.6, 0.6) * _left(along)
-    return torch.where(gap > _NEAR, round_it, -0.5 * direction)
-
-
-def _left(direction: torch.Tensor) -> torch.Tensor:
-    return torch.stack([-direction[..., 1], direction[..., 0]], dim=-1)
-
-
-def _components(vector: torch.Tensor, along: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return a vector's components along a direction and to its left, shape ``[*, 1]`` each."""
-    return (vector * along).sum(-1, keepdim=True), (vector * _left(along)).sum(-1, keepdim=True)
-
-
-def _face_distance(offset: torch.Tensor, heading: torch.Tensor, half: torch.Tensor) -> torch.Tensor:
-    """Return how far a square's outline is from its centre, seen from a point [m], shape ``[*, 1]``.
-
-    Args:
-        offset: From the point to the centre [m], shape ``[*, 2]``.
-        heading: Cosine and sine of four times the square's yaw [1], shape ``[*, 2]``.
-        half: Half its edge [m], shape ``[*, 1]``.
-    """
-    yaw = torch.atan2(heading[..., 1], heading[..., 0]) / 4
-    bearing = geometry.quarter_turn(geometry.angle_of(offset) - yaw)
-    return half / bearing.cos()[..., None]

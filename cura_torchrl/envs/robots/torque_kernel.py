@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from cura_torchrl.compiled import Doubles, compiled
-from cura_torchrl.envs.robots.ridgeback_franka import BASE_DOF
+from cura_torchrl.envs.robots.ridgeback import BASE_DOF
 
 
 @compiled
@@ -17,17 +17,19 @@ def torques_of_one(
 ) -> None:  # fmt: skip
     """Work out torques as :meth:`cura_torchrl.envs.robots.controller.ImpedanceController.torques` does.
 
+    With no joints but the base's (J = 3) it is :meth:`cura_torchrl.envs.robots.base_controller.BaseController.torques`.
+
     Args:
         world: Which robot n.
-        joints: Its joints' positions and velocities [m or rad; per second], shape ``[2, 10]``.
+        joints: Its joints' positions and velocities [m or rad; per second], shape ``[2, J]``; J is 10 with an arm.
         motions: Velocity command of the bases and reference of the arms, moved on in row n; then the command's target
-            and the reference's rate; shape ``[N, 2, 10]``.
-        gains: What turns the spring's and damper's forces into torques [1], shape ``[N, 10, 10]``.
+            and the reference's rate; shape ``[N, 2, J]``.
+        gains: What turns the spring's and damper's forces into torques [1], shape ``[N, J, J]``.
         constants: Stiffness, damping, torque limit, lowest and highest reference, and change of the velocity command in
-            a tick, by joint, shape ``[6, 10]``.
+            a tick, by joint, shape ``[6, J]``.
         period: Time between two ticks [s].
         speed_bound: Largest square of the base's speed [m^2/s^2].
-        torque: Where the forces and torques go [N or N m], shape ``[10]``.
+        torque: Where the forces and torques go [N or N m], shape ``[J]``.
     """
     state, target, gain = motions[world, 0], motions[world, 1], gains[world]
     position, velocity = joints[0], joints[1]

@@ -24,9 +24,9 @@ class WorldState:
     base_velocity: torch.Tensor
     """Base velocity (x [m/s], y [m/s], yaw [rad/s]), shape ``[N, 3]``."""
     joint_position: torch.Tensor
-    """Arm joint positions [rad], shape ``[N, 7]``."""
+    """Arm joint positions [rad], shape ``[N, 7]``; ``[N, 0]`` without an arm."""
     joint_velocity: torch.Tensor
-    """Arm joint velocities [rad/s], shape ``[N, 7]``."""
+    """Arm joint velocities [rad/s], same shape."""
     object_position: torch.Tensor
     """Centre of the object's cube [m], shape ``[N, 3]``."""
     object_quaternion: torch.Tensor
@@ -44,7 +44,7 @@ class SceneState:
     """How B worlds start, world frame."""
 
     joint_position: torch.Tensor
-    """Joints (base x [m], y [m], yaw [rad], arm [rad]), shape ``[B, J]``."""
+    """Joints (base x [m], y [m], yaw [rad], arm [rad]), shape ``[B, J]``; J is 10, or 3 without an arm."""
     object_edge: torch.Tensor
     """Edge of the pushed cube [m], shape ``[B]``."""
     object_mass: torch.Tensor
@@ -60,18 +60,14 @@ class SceneState:
 
 
 @dataclass(frozen=True)
-class RobotShape:
-    """The robot seen from above, as a planar simulator takes it."""
+class ArmShape:
+    """An arm with a hand seen from above, as a planar simulator takes it."""
 
-    chassis_size: tuple[float, float]
-    """Length and width of the chassis, a rectangle around the base's centre [m]."""
-    chassis_height: float
-    """Height above the ground at which the chassis pushes [m]."""
     hand_size: tuple[float, float]
     """Length and width of the hand, a rectangle whose front lies ahead of the TCP [m]."""
     hand_front: tuple[float, float]
     """How far the fingertips reach beyond the TCP, along the hand's axis and across it, in the vertical plane [m]."""
-    arm_half_width: float
+    half_width: float
     """Half the width of the arm between chassis and TCP [m]."""
     joint_lower: tuple[float, ...]
     """Lower stop of each joint of the arm [rad]."""
@@ -80,8 +76,23 @@ class RobotShape:
 
 
 @dataclass(frozen=True)
+class RobotShape:
+    """The robot seen from above, as a planar simulator takes it."""
+
+    chassis_size: tuple[float, float]
+    """Length and width of the chassis, a rectangle around the base's centre [m]."""
+    chassis_height: float
+    """Height above the ground at which the chassis pushes [m]."""
+    arm: ArmShape | None = None
+    """The arm, if the chassis carries one."""
+
+
+@dataclass(frozen=True)
 class HandLinearization:
-    """The hand about a joint position, in the base frame (on the ground below the base's centre)."""
+    """The hand about a joint position, in the base frame (on the ground below the base's centre).
+
+    For a robot without an arm the front face is the hand: it never moves, and there are no arm joints.
+    """
 
     tcp: torch.Tensor
     """TCP's position [m], shape ``[N, 3]``."""
@@ -94,7 +105,7 @@ class HandLinearization:
 
 
 class TorqueLaw(Protocol):
-    """What computes joint torques; see :class:`cura_torchrl.envs.robots.controller.ImpedanceController`."""
+    """What computes joint torques; see :class:`cura_torchrl.envs.robots.base_controller.BaseController`."""
 
     ik_ticks: int
     hand: HandLinearization

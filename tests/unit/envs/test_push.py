@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
 
-from cura_torchrl.envs.config import LidarConfig, PushEnvConfig, ScenarioConfig, TaskConfig
+from cura_torchrl.envs.config import LidarConfig, PushEnvConfig, RobotConfig, ScenarioConfig, TaskConfig
+from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.push import PushEnv
 from tests.contracts.env import LIMIT, EnvContract, assert_same, draw_actions, play
 from tests.worlds import place
@@ -45,6 +47,26 @@ class TestPlanarPushEnv(EnvContract):
         return PushEnv(num_envs, dataclasses.replace(make_config(limit), simulator="planar"), **kwargs)
 
 
+BARE = {"robot": RobotConfig(model="ridgeback")}
+"""Changes that take the arm away."""
+
+
+class TestBasePushEnv(EnvContract):
+    """The same without an arm, on PyBullet."""
+
+    def make_env(self, num_envs: int, *, limit: int = LIMIT, **kwargs: Any) -> PushEnv:
+        """Return the environment of the bare base on PyBullet."""
+        return PushEnv(num_envs, dataclasses.replace(make_config(limit), **BARE), **kwargs)
+
+
+class TestPlanarBasePushEnv(EnvContract):
+    """The same without an arm, on the planar simulator."""
+
+    def make_env(self, num_envs: int, *, limit: int = LIMIT, **kwargs: Any) -> PushEnv:
+        """Return the environment of the bare base on tensors."""
+        return PushEnv(num_envs, dataclasses.replace(make_config(limit), simulator="planar", **BARE), **kwargs)
+
+
 @pytest.fixture
 def make() -> Iterator[Any]:
     """Build environments that are closed after the test."""
@@ -61,7 +83,7 @@ def make() -> Iterator[Any]:
 
 def steady(env: PushEnv, steps: int, *action: float) -> torch.Tensor:
     """Return one action for all rows and steps, shape ``[T, N, 6]``."""
-    return torch.tensor(action).expand(steps, env.num_envs, 6)
+    return torch.tensor(action).expand(steps, env.num_envs, len(action))
 
 
 def obstructed(x: float, y: float, **overrides: Any) -> PushEnvConfig:
@@ -104,6 +126,52 @@ def test_a_collision_terminates_and_tells_what_touched(make, place, action, expe
     torch.testing.assert_close(after["reward"][step, 0], after["reward_terms"][step].sum())
     assert data["elapsed_steps"][step + 1] == 0
     assert not data["contact"][step + 1].any()
+
+
+@pytest.mark.parametrize("simulator", ["bullet", "planar"])
+@pytest.mark.parametrize(
+    ("place", "action", "expected"),
+    [
+        # The base stands at x = -0.45 - 0.48 = -0.93: its chassis from -1.41 to the face at -0.45.
+        ((-2.0, 0.0), (-1.0, 0.0, 0.0), [True, False, False]),  # 0.31 m behind the chassis, backwards
+        ((-0.55, 0.85), (0.0, 1.0, 0.0), [True, False, False]),  # beside the face, where an arm's hand would be
+        ((0.75, 0.0), (1.0, 0.0, 0.0), [False, False, True]),  # 0.2 m before the object, which the face pushes
+    ],
+)
+def test_a_bare_base_tells_what_touched(make, simulator, place, action, expected):
+    """Catches contacts of an arm that is not there, and a face that does not push."""
+    env = make(1, dataclasses.replace(obstructed(*place), simulator=simulator, **BARE))
+    root = env.reset(episodes=torch.tensor([2]))
+    assert env.obstacles[0].sum() == 1
+    after = play(env, steady(env, 10, *action), root)[0]["next"]
+    step = int(after["terminated"].int().argmax())
+    assert after["terminated"][step]
+    assert after["contact"][step].tolist() == expected
+
+
+@pytest.mark.parametrize("simulator", ["bullet", "planar"])
+def test_without_an_arm_the_face_is_the_tcp(make, simulator):
+    """Catches a start gap, an observation or a reward that is measured from elsewhere than the face's centre."""
+    env = make(1, dataclasses.replace(obstructed(9.0, 3.0), simulator=simulator, **BARE))
+    data = env.reset(episodes=torch.tensor([2]))
+    torch.testing.assert_close(data["sensor_pose"], torch.tensor([[-0.93, 0.0, 0.0]]))
+    seen = {name: data["observation"][0, part] for name, part in OBSERVATION_SLICES.items()}
+    assert seen["tcp_position"].tolist() == pytest.approx([0.48, 0.0, 0.18])
+    assert seen["hand_axes"].tolist() == [1.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    assert seen["previous_action"].shape == (3,)
+    after = env.step(data.set("action", torch.tensor([[0.2, -0.1, 0.5]])))["next"]
+    seen = {name: after["observation"][0, part] for name, part in OBSERVATION_SLICES.items()}
+    vx, vy, wz = seen["base_velocity"].tolist()
+    assert seen["tcp_velocity"].tolist() == pytest.approx([vx, vy + 0.48 * wz, 0.0], abs=1e-6)
+    assert seen["previous_action"].tolist() == pytest.approx([0.2, -0.1, 0.5])
+    x, y, yaw = after["sensor_pose"][0].double().tolist()
+    face = torch.tensor([x + 0.48 * math.cos(yaw), y + 0.48 * math.sin(yaw), 0.18], dtype=torch.float64)
+    # The object stands straight at the origin, its centre 0.25 m above the ground.
+    point = env.scenario["surface_point"][0] + torch.tensor([0.0, 0.0, 0.25])
+    expected = math.exp(-0.1 * (point - face).norm().item())
+    assert after["reward_terms"][0, 3].item() == pytest.approx(expected, abs=1e-3)
+    # The base was at rest: acceleration is velocity over 0.2 s.
+    assert after["reward_terms"][0, 5].item() == pytest.approx(-0.1 * math.hypot(vx, vy, wz) / 0.2, rel=1e-4)
 
 
 def test_the_time_limit_truncates_and_nothing_else_ends_an_episode(make):

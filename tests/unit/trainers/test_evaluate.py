@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from contextlib import closing
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.trainers import evaluate as module
 from cura_torchrl.trainers.build import Networks, make_env
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
-from cura_torchrl.trainers.evaluate import Episode, evaluate, play_episodes, summarise
+from cura_torchrl.trainers.evaluate import Episode, Player, evaluate, play_episodes, summarise
 
 REQUIRED = {
     "method", "scenario", "object_size", "episodes", "successes", "success_rate", "wilson_low", "wilson_high",
@@ -126,6 +127,16 @@ def test_the_result_has_what_scripts_rely_on_and_is_json() -> None:
     assert result["episodes"] == 3  # the second world stands still in the end
     assert (result["method"], result["timeouts"], result["mean_steps"]) == ("random", 3, 5.0)
     json.dumps(result, allow_nan=False)
+
+
+@pytest.mark.usefixtures("short_task")
+@pytest.mark.parametrize("policy", ["scripted", "avoider", "random"])
+def test_the_base_alone_is_played_by_name(policy: str) -> None:
+    """Catches a robot that is named in the result and another one that plays."""
+    config = EvaluateConfig(policy=policy, robot="ridgeback", simulator="planar", episodes=2, chunk=2)
+    with closing(Player(config)) as player:
+        assert player._env.action_spec.shape == (2, 3)
+    assert evaluate(config)["robot"] == "ridgeback"
 
 
 @pytest.mark.usefixtures("short_task")

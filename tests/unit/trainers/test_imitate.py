@@ -13,6 +13,7 @@ from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE, OBSERVATION_SLI
 from cura_torchrl.envs.robots.scripted import ScriptedPusher
 from cura_torchrl.trainers.build import LATENT_SIZE, Networks
 from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, restore
+from cura_torchrl.trainers.errors import CheckpointError
 from cura_torchrl.trainers.imitate import ImitateConfig, _make_env, _rounds, _train_config, imitate
 from cura_torchrl.trainers.methods import method
 
@@ -86,6 +87,20 @@ def test_the_avoiders_actions_are_what_is_learned():
     kept = _played(config)[0]
     blind = ScriptedPusher()(kept.select("observation").clone())["action"]
     assert (kept["action"] - blind).abs().amax() > 0.2
+
+
+@pytest.mark.parametrize("expert", ["scripted", "avoider"])
+def test_the_base_alone_has_warm_starts_of_its_own(tmp_path, expert):
+    """Catches an expert or noise of the arm's six actions, and a start that the method's networks cannot take."""
+    sizes = {"num_envs": 2, "rounds": 2, "steps": 4, "epochs": 1, "minibatch_size": 8}
+    config = ImitateConfig(run_dir=tmp_path, expert=expert, method="push-base", simulator="planar", **sizes)
+    path = imitate(config)
+    assert read_config(find_checkpoint(path))[0].env.robot.model == "ridgeback"
+    networks = Networks(method("cura-ppo-base"))
+    restore(find_checkpoint(path), {"networks": networks})
+    assert networks.observation_norm.mean.shape == (30,)
+    with pytest.raises(CheckpointError, match="does not fit"):
+        restore(find_checkpoint(path), {"networks": Networks(method("cura-ppo"))})
 
 
 def test_a_round_goes_on_where_the_last_one_ended():

@@ -8,20 +8,23 @@ import pytest
 
 from cura_torchrl.trainers.methods import EXTENSIONS, METHODS, PRESETS, method
 
-# Paper, Sec. V: (object hides what is behind it, alpha, lambda_r, lambda_u); alpha = 1 is a map without confidence.
+# Paper, Sec. V: (name there, object hides what is behind it, alpha, lambda_r, lambda_u, robot); alpha = 1 is a map
+# without confidence.
 PAPER = {
-    "push-no-occlusion": (False, 1.0, 0.0, 0.0),
-    "push": (True, 1.0, 0.0, 0.0),
-    "cura-ppo": (True, 0.9, 0.25, 1.0),
-    "push-conf": (True, 0.9, 0.0, 0.0),
-    "cura-no-uncertainty": (True, 0.9, 0.25, 0.0),
-    "cura-no-risk": (True, 0.9, 0.0, 1.0),
+    "push-no-occlusion": ("Push w/o Occlusion", False, 1.0, 0.0, 0.0, "ridgeback_franka"),
+    "push": ("Push w/ Occlusion", True, 1.0, 0.0, 0.0, "ridgeback_franka"),
+    "cura-ppo": ("CURA-PPO", True, 0.9, 0.25, 1.0, "ridgeback_franka"),
+    "push-conf": ("Baseline w/ Conf.", True, 0.9, 0.0, 0.0, "ridgeback_franka"),
+    "cura-no-uncertainty": ("CURA w/o Uncertainty", True, 0.9, 0.25, 0.0, "ridgeback_franka"),
+    "cura-no-risk": ("CURA w/o Risk", True, 0.9, 0.0, 1.0, "ridgeback_franka"),
+    "push-base": ("Push w/ Base", True, 1.0, 0.0, 0.0, "ridgeback"),
+    "cura-ppo-base": ("CURA-PPO w/ Base", True, 0.9, 0.25, 1.0, "ridgeback"),
 }
 
 
 @pytest.mark.parametrize(("name", "row"), PAPER.items())
-def test_a_preset_has_the_paper_s_occlusion_decay_and_share_of_the_costs(
-    name: str, row: tuple[bool, float, float, float]
+def test_a_preset_has_the_paper_s_occlusion_decay_share_of_the_costs_and_robot(
+    name: str, row: tuple[str, bool, float, float, float, str]
 ) -> None:
     """Catches a method that is compared under another's settings.
 
@@ -30,10 +33,12 @@ def test_a_preset_has_the_paper_s_occlusion_decay_and_share_of_the_costs(
     config = method(name)
     assert config.cura.advantage_scale == "zscore"
     assert (
+        METHODS[name].label,
         config.env.lidar.occlusion,
         config.map.decay,
         4.0 * config.cura.risk_coeff,
         4.0 * config.cura.uncertainty_coeff,
+        config.env.robot.model,
     ) == row
     assert config.method == name
 
@@ -45,7 +50,11 @@ def test_methods_differ_in_nothing_else() -> None:
         config = method(name)
         return config.replace(
             method="",
-            env=dataclasses.replace(config.env, lidar=dataclasses.replace(config.env.lidar, occlusion=True)),
+            env=dataclasses.replace(
+                config.env,
+                lidar=dataclasses.replace(config.env.lidar, occlusion=True),
+                robot=dataclasses.replace(config.env.robot, model="ridgeback_franka"),
+            ),
             map=dataclasses.replace(config.map, decay=1.0),
             cura=dataclasses.replace(config.cura, risk_coeff=0.0, uncertainty_coeff=0.0),
         )

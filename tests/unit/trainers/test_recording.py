@@ -55,6 +55,19 @@ def test_clearance_is_from_the_nearest_of_chassis_arm_and_object() -> None:
     assert make_recording(obstacles=behind).clearance[-1] == pytest.approx(0.52, abs=1e-5)
 
 
+def test_without_an_arm_the_clearance_is_that_of_the_chassis() -> None:
+    """Catches a strip for an arm that is not there, which would stick out of the front face by its half width."""
+    along, zero = 0.5 * np.arange(7), np.zeros(7)
+    face = np.stack([along + 0.48, zero], -1).astype(np.float32)
+    obstacles = np.zeros((7, 6, 4), dtype=np.float32)
+    # Chassis' front at 3 + 0.48 = 3.48 m in the last state; obstacle's face at 3.9 m.
+    obstacles[:, 0] = (4.1, 0.0, 0.0, 0.4)
+    far = make_recording().object_pose + np.array([20.0, 0.0, 0.0], dtype=np.float32)
+    recording = make_recording(tcp=face, obstacles=obstacles, object_pose=far)
+    assert recording.clearance[-1] == pytest.approx(0.42, abs=1e-5)
+    assert (recording.has_arm, make_recording().has_arm) == (False, True)
+
+
 def test_final_distance_is_that_of_the_last_state() -> None:
     """Catches the distance of the first state, or of the robot."""
     # Object at (4.5, 0), goal at (12, 1): sqrt(7.5^2 + 1).

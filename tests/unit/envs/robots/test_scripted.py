@@ -6,17 +6,24 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from cura_torchrl.envs.config import RobotConfig
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE, OBSERVATION_SLICES
 from cura_torchrl.envs.robots.scripted import ScriptedAvoider, ScriptedPusher
+
+BARE = RobotConfig(model="ridgeback")
+"""The base without an arm, whose face's centre is 0.48 m ahead."""
 
 FREE = torch.zeros(1, 6, 4)
 """No obstacle."""
 
 
-def observe(centre: tuple[float, float], goal: tuple[float, float], obstacles: torch.Tensor = FREE) -> TensorDict:
-    """Return what a robot at the origin sees: hand at (0.9, 0), box of edge 0.5, everything at rest."""
+def observe(
+    centre: tuple[float, float], goal: tuple[float, float], obstacles: torch.Tensor = FREE, reach: float = 0.9
+) -> TensorDict:
+    """Return what a robot at the origin sees: TCP at (reach, 0), box of edge 0.5, everything at rest."""
     observation = torch.zeros(1, OBSERVATION_SIZE)
-    parts = {"tcp_position": (0.9, 0.0, 0.28), "object_position": (*centre, 0.25), "goal_position": goal}
+    observation[0, OBSERVATION_SLICES["object_heading"]] = torch.tensor([1.0, 0.0])
+    parts = {"tcp_position": (reach, 0.0, 0.28), "object_position": (*centre, 0.25), "goal_position": goal}
     for name, value in parts.items():
         observation[0, OBSERVATION_SLICES[name]] = torch.tensor(value)
     data = {"observation": observation, "obstacles": obstacles, "sensor_pose": torch.zeros(1, 3)}
@@ -123,3 +130,67 @@ def test_near_the_goal_the_avoider_is_the_pusher():
     """Catches a last metre along cell centres, which would miss the tolerance."""
     near = ((1.15, 0.0), (1.9, 0.2))
     assert act(ScriptedAvoider(), *near) == pytest.approx(act(ScriptedPusher(), *near), abs=1e-5)
+
+
+def act_bare(policy: ScriptedPusher, *args, **kwargs) -> list[float]:
+    """Return the action of a base without an arm."""
+    return act(policy, *args, reach=0.48, **kwargs)
+
+
+def test_the_face_pushes_straight_at_a_goal_ahead():
+    """Catches an action with an arm, and a push aside."""
+    vx, vy, wz = act_bare(ScriptedPusher(BARE), (0.73, 0.0), (10.0, 0.0))
+    assert vx > 0.5
+    assert (vy, wz) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_base_turns_about_the_object_that_it_pushes(side: float):
+    """Catches a turn that lets the object slide along the face: its centre has to move straight ahead."""
+    vx, vy, wz = act_bare(ScriptedPusher(BARE), (0.73, 0.0), (8.0, side * 3.0))
+    assert wz * side > 0.2
+    assert vx > 0.4
+    # v + w x r across the face, r = (0.73, 0), with 0.8 m/s and 1 rad/s at an action of 1.
+    assert 0.8 * vy + 0.73 * wz == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_base_backs_off_an_object_that_slips_off_its_face():
+    """Catches a corner of the chassis that pushes on: the object would turn away from it."""
+    vx, vy, _ = act_bare(ScriptedPusher(BARE), (0.73, 0.35), (10.0, 0.35))
+    assert vx < -0.5
+    assert abs(vy) < 0.2
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_base_comes_round_an_object_beside_it(side: float):
+    """Catches a chassis that drives sideways into the object: first it goes back, then behind it."""
+    beside = act_bare(ScriptedPusher(BARE), (0.2, 1.0 * side), (10.0, 1.0 * side))
+    assert beside[0] < -0.5
+    assert beside[1] == pytest.approx(0.0, abs=1e-6)
+    behind = act_bare(ScriptedPusher(BARE), (1.1, 0.8 * side), (10.0, 0.8 * side))
+    assert behind[1] * side > 0.5
+
+
+def test_actions_of_the_base_are_admissible_wherever_things_are():
+    """Catches actions outside [-1, 1], a base faster than its limit, NaN, and rows that depend on others."""
+    generator = torch.Generator().manual_seed(0)
+    data = TensorDict({"observation": 5 * torch.randn(500, OBSERVATION_SIZE - 3, generator=generator)}, [500])
+    action = ScriptedPusher(BARE)(data.clone())["action"]
+    assert action.shape == (500, 3)
+    assert action.isfinite().all()
+    assert (action.abs() <= 1.0).all()
+    assert (action[:, :2].norm(dim=-1) <= 1.0 + 1e-5).all()
+    torch.testing.assert_close(ScriptedPusher(BARE)(data[7:8].clone())["action"], action[7:8])
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_avoider_without_an_arm_steers_around_an_obstacle(side: float):
+    """Catches a route or a clearance that only the arm's robot keeps."""
+    obstacles = FREE.clone()
+    obstacles[0, 2] = torch.tensor([2.8, -0.5 * side, 0.0, 1.0])
+    around = act_bare(ScriptedAvoider(BARE), (0.75, 0.05 * side), (8.1, 0.05 * side), obstacles)
+    assert around[2] * side > 0.05
+    ahead = FREE.clone()
+    ahead[0, 0] = torch.tensor([1.1, 0.0, 0.0, 0.4])  # 0.9 m ahead: 0.22 m beyond the chassis' disc and its clearance
+    free = act_bare(ScriptedAvoider(BARE), (5.0, 0.0), (12.0, 0.0))
+    assert 0.0 <= act_bare(ScriptedAvoider(BARE), (5.0, 0.0), (12.0, 0.0), ahead)[0] < free[0]
