@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 class PushGym(gymnasium.Env):
     """Push a box to a goal, for learners that speak Gymnasium.
 
-    The observation is the vector of :mod:`cura_torchrl.envs.mdp.observations` (33 numbers, without an arm 30), then the code of the
-    confidence map (32). ``info`` holds ``cost`` (1 on collision), ``contact`` (base, arm, object), ``success`` (for
+    The observation is the vector of :mod:`cura_torchrl.envs.mdp.observations` (33 numbers, without an arm 30), then
+    the code of the confidence map (32). ``info`` holds ``cost`` (1 on collision), ``contact`` (base, arm, object), ``success`` (for
     each of ``TaskConfig.tolerances``), ``is_success`` (the first of them) and ``scenario`` (its index). Episodes end by
     themselves: a collision terminates, time truncates.
 
@@ -103,7 +103,8 @@ class PushGym(gymnasium.Env):
         """Play a policy step.
 
         Args:
-            action: Base (vx, vy, wz) and end-effector (vx, vy, vz) as shares of their maxima, shape ``[A]``; a base without an arm has the first three alone.
+            action: Base (vx, vy, wz) and end-effector (vx, vy, vz) as shares of their maxima, shape ``[6]``;
+                without an arm the first three alone.
 
         Returns:
             Observation, reward, whether a collision ended the episode, whether time did, and info.
