@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 class PushGym(gymnasium.Env):
     """Push a box to a goal, for learners that speak Gymnasium.
 
-    The observation is the vector of :mod:`cura_torchrl.envs.mdp.observations` (33 numbers, without an arm 30), then
-    the code of the confidence map (32). ``info`` holds ``cost`` (1 on collision), ``contact`` (base, arm, object), ``success`` (for
-    each of ``TaskConfig.tolerances``), ``is_success`` (the first of them) and ``scenario`` (its index). Episodes end by
-    themselves: a collision terminates, time truncates.
+    The observation is the vector of :mod:`cura_torchrl.envs.mdp.observations` (33 numbers, without an arm 30), then the
+    code of the confidence map (32). ``info`` holds ``cost`` (1 on collision), ``contact`` (base, arm, object),
+    ``success`` (for each of ``TaskConfig.tolerances``), ``is_success`` (the first of them) and ``scenario`` (its
+    index). Episodes end by themselves: a collision terminates, time truncates.
 
     ``reset(seed=s)`` starts the scenarios of seed s anew, and every further reset plays the next one;
     ``reset(options={"scenario": i})`` plays the i-th.
