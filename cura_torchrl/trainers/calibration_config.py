@@ -5,13 +5,11 @@ from __future__ import annotations
 import difflib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from cura_torchrl.envs.config import Simulator, require, require_finite
 from cura_torchrl.trainers.info import shipped_methods
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
+from cura_torchrl.trainers.lists import split_names
 
 CONDITIONS: dict[str, dict[str, Any]] = {
     "on-policy": {},
@@ -56,7 +54,7 @@ class CalibrateConfig:
     def __post_init__(self) -> None:
         require_finite(self)
         for name in ("methods", "conditions"):
-            object.__setattr__(self, name, _split(getattr(self, name)))
+            object.__setattr__(self, name, split_names(getattr(self, name)))
             require(bool(getattr(self, name)), name, getattr(self, name), "one or more")
         for name in self.methods:
             known = name in shipped_methods() or Path(name).exists()
@@ -72,11 +70,6 @@ class CalibrateConfig:
             fits, "repeats", self.repeats, f"a divisor of {self.futures} futures, with 2 groups or more of 2 or more"
         )
         require(0 <= self.seed < 2**31, "seed", self.seed, "0 to 2147483647")
-
-
-def _split(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names, each once, those that are joined by commas apart."""
-    return tuple(dict.fromkeys(part.strip() for name in names for part in name.split(",") if part.strip()))
 
 
 def _accepted(name: str, names: list[str]) -> str:

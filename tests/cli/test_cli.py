@@ -149,7 +149,7 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
         (["train-all", "--runs", "{tmp}", "--", "--num-evns", "3"], "Unrecognized options: --num-evns"),
         (["view", "--port", "0"], "port is 0; accepted: 1 to 65535"),
         (["view", "--speed", "-1"], "speed is -1.0; accepted: a positive number"),
-        (["report"], "RUNS"),
+        (["report"], "runs is (); accepted: one or more methods or folders"),
         (["report", "{tmp}/none"], "no checkpoint at"),
         (["report", "push", "--table", "{tmp}"], "no table.md in"),
         (["report", "push", "--calibration", "{tmp}"], "no calibration.md in"),

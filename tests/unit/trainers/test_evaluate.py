@@ -113,9 +113,9 @@ def test_what_is_seen_in_a_scene_does_not_depend_on_the_scenes_before_it() -> No
 @pytest.fixture
 def short_task(monkeypatch: pytest.MonkeyPatch) -> None:
     """Episodes of 1 s, so that an evaluation is over at once."""
-    build = module._task
+    build = module.evaluation_task
     monkeypatch.setattr(
-        module, "_task", lambda task, config: dataclasses.replace(build(task, config), episode_time=1.0)
+        module, "evaluation_task", lambda task, config: dataclasses.replace(build(task, config), episode_time=1.0)
     )
 
 

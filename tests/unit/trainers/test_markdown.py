@@ -32,7 +32,8 @@ def test_text_is_escaped_and_links_lead_nowhere() -> None:
 
 def test_code_is_kept_line_by_line() -> None:
     """Catches a command whose lines are joined, or whose hash sign becomes a heading."""
-    assert to_html("```bash\n# a\n\nb\n```", no_picture) == "<pre><code># a\n\nb</code></pre>"
+    page = to_html("```bash\n# a\n\nb\n```", no_picture)
+    assert page == '<pre><code class="language-bash"># a\n\nb\n</code></pre>'
 
 
 def test_pictures_are_asked_for_by_file_and_text() -> None:
