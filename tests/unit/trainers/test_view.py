@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import socket
 import urllib.request
 from typing import TYPE_CHECKING
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from cura_torchrl.trainers.recording import Recording
-
-needs_viser = pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="the extra live is not installed")
 
 
 @pytest.fixture
@@ -43,7 +40,6 @@ def test_a_missing_extra_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) ->
         View(ViewConfig())
 
 
-@needs_viser
 def test_a_state_is_shown_where_it_is(shown: View) -> None:
     """Catches a body that is missing, turned or in another place, and a page that is not served."""
     shown.show(make_recording(), 6)
@@ -60,7 +56,6 @@ def test_a_state_is_shown_where_it_is(shown: View) -> None:
     assert shown._map.image.shape == (300, 300, 3)
 
 
-@needs_viser
 @pytest.mark.parametrize("recorded", [False, True])
 def test_a_scene_is_played_to_its_end(recorded: bool, shown: View, tmp_path: Path) -> None:
     """Catches an episode that stops, states that are not shown, and a next scene that does not come."""
@@ -79,7 +74,6 @@ def test_a_scene_is_played_to_its_end(recorded: bool, shown: View, tmp_path: Pat
     assert shown.scene_index.value == 1
 
 
-@needs_viser
 def test_a_chosen_scene_ends_the_one_before(shown: View, tmp_path: Path) -> None:
     """Catches a button that does nothing while the view is paused."""
     shown.playing.value = False
