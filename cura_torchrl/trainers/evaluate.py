@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import sys
 from contextlib import closing
@@ -308,9 +307,16 @@ def _play_in_worker(part: Part) -> list[Episode]:
         return _worker_player(part.config).play(part, lambda _: count_one())
 
 
-@functools.lru_cache(maxsize=1)
+_players: dict[EvaluateConfig, Player] = {}
+"""In a worker: the one that played last."""
+
+
 def _worker_player(config: EvaluateConfig) -> Player:
-    return Player(config)
+    if config not in _players:
+        while _players:
+            _players.popitem()[1].close()  # worlds of PyBullet take 28 MB each until they are closed
+        _players[config] = Player(config)
+    return _players[config]
 
 
 def _build(config: EvaluateConfig) -> tuple[EnvBase, Callable[[TensorDictBase], TensorDictBase]]:

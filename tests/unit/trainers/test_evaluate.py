@@ -151,3 +151,27 @@ def test_the_result_does_not_depend_on_the_number_of_processes() -> None:
     """Catches processes that play the same scenes, or a scene that depends on who plays it."""
     config = EvaluateConfig(policy="scripted", episodes=3, chunk=2)
     assert evaluate(config) == evaluate(dataclasses.replace(config, num_workers=2))
+
+
+def test_a_worker_closes_the_worlds_of_the_cell_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches worlds that pile up, cell by cell, until there is no memory left."""
+    made, closed = [], []
+
+    class Watched(Player):
+        def __init__(self, config: EvaluateConfig) -> None:
+            super().__init__(config)
+            made.append(self)
+
+        def close(self) -> None:
+            super().close()
+            closed.append(self)
+
+    monkeypatch.setattr(module, "Player", Watched)
+    for size, worlds in ((0.5, 1), (0.5, 1), (1.0, 2)):
+        config = EvaluateConfig(policy="scripted", object_size=size, simulator="planar", chunk=1, episodes=1)
+        player = module._worker_player(config)
+        assert player is made[-1]
+        assert len(made) == worlds
+    assert closed == made[:1]
+    made[-1].close()
+    module._players.clear()
