@@ -26,9 +26,9 @@ export OMP_NUM_THREADS=1
 starts=(${START:+"$START"})
 if [ -z "${START:-}" ]; then
   for method in "${methods[@]}"; do
-    # The warm start depends on what the LiDAR and the map show, not on the costs: methods that see the same share it.
+    # The warm start depends on the robot, and on what LiDAR and map show, not on the costs: methods that see the same share it.
     case $method in
-      push | push-no-occlusion) sees=$method ;;
+      push | push-no-occlusion | *-base) sees=$method ;;
       *) sees=push-conf ;;
     esac
     start=${STARTS:-$runs}/imitate-$sees
