@@ -36,6 +36,7 @@ def reliability_figure(methods: dict[str, Any]) -> bytes:
             predicted = np.array([row["predicted"] for row in rows])
             _draw(axis, predicted, np.array([row["came_out"] for row in rows]), label=method, colour=colour)
         axis.set_xlabel("predicted P(collision within 2 s) [1]")
+    _look_closer(panels[0][0], high=True)
     panels[0][0].set_ylabel("share that collided [1]")
     panels[0][0].legend(fontsize=8, loc="upper left")
     return encode(figure, "png")
@@ -58,8 +59,9 @@ def coverage_figure(methods: dict[str, Any]) -> bytes:
             promised = np.array([row["promised"] for row in rows])
             _draw(axis, promised, np.array([row["came_out"] for row in rows]), label=method, colour=colour)
         axis.set_xlabel("promised coverage [1]")
+    _look_closer(panels[0][0], high=False)
     panels[0][0].set_ylabel("share inside the interval [1]")
-    panels[0][0].legend(fontsize=8, loc="lower right")
+    panels[0][0].legend(fontsize=8, loc="upper left")
     return encode(figure, "png")
 
 
@@ -105,6 +107,17 @@ def _panels(methods: dict[str, Any]) -> tuple[Figure, list[tuple[Any, str]]]:
         axis.set_title(condition, loc="left", fontsize=10)
         axis.grid(alpha=0.3)
     return figure, list(zip(axes, conditions, strict=True))
+
+
+def _look_closer(axis: Any, *, high: bool) -> None:
+    """Let all panels show where points are, near 0 or near 1; intervals may reach beyond."""
+    points = [np.concatenate(bars.lines[0].get_data()) for panel in axis.figure.axes for bars in panel.containers]
+    if not points:
+        return
+    far = float((np.concatenate(points) if high else 1.0 - np.concatenate(points)).max())
+    reach, margin = min(1.0, 1.5 * far + 0.02), 0.02
+    limits = (-margin * reach, reach) if high else (1.0 - reach, 1.0 + margin * reach)
+    axis.set(xlim=limits, ylim=limits)
 
 
 def _draw(axis: Any, x: NDArray[np.float64], rows: NDArray[np.float64], *, label: str, colour: str) -> None:
