@@ -101,7 +101,7 @@ def _add_legend(figure: Figure, methods: list[str], results: list[Result], title
     interval = "Wilson's 95 % interval" if results[0].seeds == 1 else "95 % bootstrap interval of the IQM over seeds"
     handles.append(Line2D([], [], color=raster.INK, linestyle="none", marker="|", markersize=11, label=interval))
     height = float(figure.get_size_inches()[1])
-    columns = min(len(handles), 5 if len(methods) > _FEW else 3)
+    columns = min(len(handles), 4 if len(methods) > _FEW else 3)
     figure.subplots_adjust(top=1 - 0.1 / height, bottom=0.4 / height, left=0.08, right=0.99, hspace=0.22)
     figure.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.07, 1.0), ncols=columns, frameon=False)
     rows = -(-len(handles) // columns)
