@@ -24,7 +24,7 @@ from cura_torchrl.trainers.errors import NodeLostError, NonFiniteError, Unavaila
 
 try:
     import ray
-    from ray.exceptions import RayActorError, RayError, RayTaskError
+    from ray.exceptions import ActorUnavailableError, RayActorError, RayError, RayTaskError
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 except ImportError:
     ray = None
@@ -44,6 +44,8 @@ START_SECONDS = 300.0
 """Time in which every worker has to be there [s]: it imports torch and builds its worlds."""
 PROBE_SECONDS = 2.0
 """Time in which Ray tells which workers are dead [s], once a call to one of them has failed."""
+UNAVAILABLE_SECONDS = 8.0
+"""The same where one cannot be reached and is not known to be dead [s]."""
 DROPPED_KEYS = (keys.SCAN, ("next", keys.SCAN))
 """What no one reads in a rollout: four fifths of its bytes. The map has seen the scan already."""
 
@@ -118,7 +120,9 @@ class RayRollouts:
         # Asks every worker: the failed call names one, and a node takes several with it. One that is busy counts as
         # alive. Ray's list of nodes is no help: it shows a dead one until a health check fails.
         pings = [worker.__ray_ready__.remote() for worker in self._collector.remote_collectors]
-        answered, _ = ray.wait(pings, num_returns=len(pings), timeout=PROBE_SECONDS)
+        # A connection may break before Ray knows that who was at its other end is dead.
+        patience = UNAVAILABLE_SECONDS if isinstance(error, ActorUnavailableError) else PROBE_SECONDS
+        answered, _ = ray.wait(pings, num_returns=len(pings), timeout=patience)
         deaths = [(node, _death(ping)) for node, ping in zip(self._nodes, pings, strict=True) if ping in answered]
         lost = {node for node, death in deaths if death is not None}
         for node, death in deaths:
