@@ -8,7 +8,7 @@ import sys
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
-    from cura_torchrl.envs.config import TaskConfig
+    from cura_torchrl.envs.config import ScenarioKind, TaskConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -351,8 +351,27 @@ def _source(config: EvaluateConfig) -> dict[str, Any]:
     }
 
 
-def evaluation_task(task: TaskConfig, config: EvaluateConfig) -> TaskConfig:
-    """Return a task with the scenes that are evaluated.
+class SceneChoice(Protocol):
+    """What configurations that play evaluation scenes have in common."""
+
+    @property
+    def scenario(self) -> ScenarioKind:
+        """Where obstacles appear."""
+        ...
+
+    @property
+    def object_size(self) -> float:
+        """Edge of the pushed cube [m]."""
+        ...
+
+    @property
+    def max_obstacles(self) -> int:
+        """Most obstacles K in an episode [1]."""
+        ...
+
+
+def evaluation_task(task: TaskConfig, config: SceneChoice) -> TaskConfig:
+    """Return a task with the scenes that are evaluated, and the true obstacles in what is emitted.
 
     Args:
         task: What the policy was trained on.
@@ -364,7 +383,7 @@ def evaluation_task(task: TaskConfig, config: EvaluateConfig) -> TaskConfig:
     scenario = dataclasses.replace(
         task.scenario, kind=config.scenario, object_edges=(config.object_size,), max_obstacles=config.max_obstacles
     )
-    # The obstacles are there for the meter; a policy reads them only if it says so.
+    # The obstacles are there for meters and pictures; a policy reads them only if it says so.
     return dataclasses.replace(
         task, scenario=scenario, stream="eval", random_first_age=False, curriculum=(), privileged=True
     )

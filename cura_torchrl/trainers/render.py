@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import sys
 from contextlib import closing
@@ -12,7 +11,6 @@ from tqdm import tqdm
 
 from cura_torchrl.trainers.animation import animation_frames, frame_numbers
 from cura_torchrl.trainers.checkpoint import load_policy
-from cura_torchrl.trainers.config import EvaluateConfig
 from cura_torchrl.trainers.estimate_figures import appearance_figure, distribution_figure
 from cura_torchrl.trainers.evaluate import evaluation_task
 from cura_torchrl.trainers.figures import layout_figure, paths_figure, snapshots_figure
@@ -59,7 +57,8 @@ def render(config: RenderConfig) -> list[Path]:
     for recording in recordings:
         logger.info("scene %d, %s: %s", config.scene, recording.label, recording.describe())
     config.out.mkdir(parents=True, exist_ok=True)
-    return [*_write_figures(config, recordings, _task(config, loaded[0])), *_write_animations(config, recordings)]
+    task = evaluation_task(loaded[0].config.env.task, config)
+    return [*_write_figures(config, recordings, task), *_write_animations(config, recordings)]
 
 
 def play_scene(config: RenderConfig, loaded: Sequence[LoadedPolicy]) -> list[Recording]:
@@ -73,7 +72,7 @@ def play_scene(config: RenderConfig, loaded: Sequence[LoadedPolicy]) -> list[Rec
         One recording a policy, with scan and map of every state.
     """
     recordings = []
-    tasks = [_task(config, policy) for policy in loaded]
+    tasks = [evaluation_task(policy.config.env.task, config) for policy in loaded]
     total = sum(round(task.episode_time / task.policy_period) + 1 for task in tasks)
     with tqdm(total=total, desc="play", unit="step", file=sys.stderr) as bar:
 
@@ -89,20 +88,6 @@ def play_scene(config: RenderConfig, loaded: Sequence[LoadedPolicy]) -> list[Rec
                 )
         bar.update(bar.total - bar.n)
     return recordings
-
-
-def _task(config: RenderConfig, loaded: LoadedPolicy) -> TaskConfig:
-    settings = EvaluateConfig(
-        checkpoint=loaded.path,
-        scenario=config.scenario,
-        object_size=config.object_size,
-        max_obstacles=config.max_obstacles,
-        seed=config.seed,
-        simulator=config.simulator,
-        chunk=config.chunk,
-    )
-    # Pictures show the true obstacles; the policies read only what they did in training.
-    return dataclasses.replace(evaluation_task(loaded.config.env.task, settings), privileged=True)
 
 
 def _write_figures(config: RenderConfig, recordings: Sequence[Recording], task: TaskConfig) -> list[Path]:

@@ -16,6 +16,7 @@ from cura_torchrl.trainers.checkpoint import LoadedPolicy, load_policy, progress
 from cura_torchrl.trainers.demo import draw_card
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.estimate_figures import distribution_figure
+from cura_torchrl.trainers.evaluate import evaluation_task
 from cura_torchrl.trainers.folder_section import read_folder
 from cura_torchrl.trainers.markup import document
 from cura_torchrl.trainers.progress import read_progress
@@ -141,16 +142,9 @@ def _players(config: ReportConfig, runs: list[Run]) -> list[Run]:
 def _play(config: ReportConfig, players: list[Run]) -> tuple[Recording, ...]:
     """Return the scene as each plays it, where and in the task that the first run is trained for."""
     trained = players[0].loaded.config
-    scenario = dataclasses.replace(
-        trained.env.task.scenario,
-        kind=config.scenario,
-        object_edges=(config.object_size,),
-        max_obstacles=config.max_obstacles,
-    )
-    # Pictures show the true obstacles; the policies read only what they did in training.
-    task = dataclasses.replace(trained.env.task, scenario=scenario, privileged=True)
+    task = evaluation_task(trained.env.task, config)
     config = dataclasses.replace(config, simulator=config.simulator or trained.simulator)
-    scene = find_scene(scenario, seed=config.seed, index=config.scene)
+    scene = find_scene(task.scenario, seed=config.seed, index=config.scene)
     states = round(task.episode_time / task.policy_period) + 1
     with tqdm(total=states * len(players), desc="play", unit="step", file=sys.stderr) as bar, one_thread():
         played = tuple(_play_one(config, player, task, scene, bar) for player in players)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.util
 import itertools
 import logging
@@ -19,7 +18,7 @@ from cura_torchrl.trainers import raster
 from cura_torchrl.trainers.animation import map_image
 from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.errors import UnavailableError
-from cura_torchrl.trainers.evaluate import play_episodes
+from cura_torchrl.trainers.evaluate import evaluation_task, play_episodes
 from cura_torchrl.trainers.recording import Recorder, Recording, find_scene, record
 from cura_torchrl.trainers.threads import one_thread
 from cura_torchrl.trainers.view_config import ViewConfig
@@ -182,17 +181,9 @@ def play_scene(config: ViewConfig, loaded: LoadedPolicy, shown: View) -> None:
         loaded: Who plays.
         shown: The view.
     """
-    task = loaded.config.env.task
-    scenario = dataclasses.replace(
-        task.scenario,
-        kind=config.scenario,
-        object_edges=(config.object_size,),
-        max_obstacles=config.max_obstacles,
-    )
-    # The view shows the true obstacles; the policy reads only what it did in training.
-    task = dataclasses.replace(task, scenario=scenario, privileged=True)
+    task = evaluation_task(loaded.config.env.task, config)
     index = int(shown.scene_index.value)
-    scene = find_scene(scenario, seed=config.seed, index=index)
+    scene = find_scene(task.scenario, seed=config.seed, index=index)
     with closing(loaded.make_env(1, task=task, simulator=config.simulator, keep_map=True, seed=config.seed)) as env:
         try:
             if config.recorded:
