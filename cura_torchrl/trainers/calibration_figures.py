@@ -11,6 +11,8 @@ from cura_torchrl.trainers.calibration_config import CONDITIONS
 from cura_torchrl.trainers.scene_axes import encode
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
 _COLOURS = ("C0", "C1", "C2", "C3", "C4", "C5", "C6", "C7")
@@ -29,17 +31,12 @@ def reliability_figure(methods: dict[str, Any]) -> bytes:
     Returns:
         Content of a PNG file.
     """
-    figure, panels = _panels(methods)
-    for axis, condition in panels:
-        for (method, found), colour in zip(methods.items(), _COLOURS, strict=False):
-            rows = [row for row in found[condition]["reliability"] if row["states"] >= _FEW]
-            predicted = np.array([row["predicted"] for row in rows])
-            _draw(axis, predicted, np.array([row["came_out"] for row in rows]), label=method, colour=colour)
-        axis.set_xlabel("predicted P(collision within 2 s) [1]")
-    _look_closer(panels[0][0], high=True)
-    panels[0][0].set_ylabel("share that collided [1]")
-    panels[0][0].legend(fontsize=8, loc="upper left")
-    return encode(figure, "png")
+
+    def curve(found: dict[str, Any]) -> list[tuple[float, list[float]]]:
+        return [(row["predicted"], row["came_out"]) for row in found["reliability"] if row["states"] >= _FEW]
+
+    labels = "predicted P(collision within 2 s) [1]", "share that collided [1]"
+    return _curves_figure(methods, curve, labels, near_zero=True)
 
 
 def coverage_figure(methods: dict[str, Any]) -> bytes:
@@ -51,18 +48,12 @@ def coverage_figure(methods: dict[str, Any]) -> bytes:
     Returns:
         Content of a PNG file.
     """
-    figure, panels = _panels(methods)
-    for axis, condition in panels:
-        for (method, found), colour in zip(methods.items(), _COLOURS, strict=False):
-            rows = found[condition]["coverage"]
-            rows = [row for row in rows if np.isfinite(row["promised"])]
-            promised = np.array([row["promised"] for row in rows])
-            _draw(axis, promised, np.array([row["came_out"] for row in rows]), label=method, colour=colour)
-        axis.set_xlabel("promised coverage [1]")
-    _look_closer(panels[0][0], high=False)
-    panels[0][0].set_ylabel("share inside the interval [1]")
-    panels[0][0].legend(fontsize=8, loc="upper left")
-    return encode(figure, "png")
+
+    def curve(found: dict[str, Any]) -> list[tuple[float, list[float]]]:
+        return [(row["promised"], row["came_out"]) for row in found["coverage"] if np.isfinite(row["promised"])]
+
+    labels = "promised coverage [1]", "share inside the interval [1]"
+    return _curves_figure(methods, curve, labels, near_zero=False)
 
 
 def truth_figure(truths: dict[str, dict[str, NDArray[Any]]]) -> bytes:
@@ -97,33 +88,48 @@ def truth_figure(truths: dict[str, dict[str, NDArray[Any]]]) -> bytes:
     return encode(figure, "png")
 
 
-def _panels(methods: dict[str, Any]) -> tuple[Figure, list[tuple[Any, str]]]:
-    """Return a figure and its panels with their conditions."""
+def _curves_figure(
+    methods: dict[str, Any],
+    curve: Callable[[dict[str, Any]], list[tuple[float, list[float]]]],
+    labels: tuple[str, str],
+    *,
+    near_zero: bool,
+) -> bytes:
+    """Return what came out by what was said, a panel a condition; a curve has value, lower and upper bound by place."""
     conditions = [name for name in CONDITIONS if name in next(iter(methods.values()))]
     figure = Figure(figsize=(0.6 + 2.9 * len(conditions), 3.3), layout="constrained")
     axes = figure.subplots(1, len(conditions), squeeze=False, sharex=True, sharey=True)[0]
+    seen = []
     for axis, condition in zip(axes, conditions, strict=True):
         axis.plot([0.0, 1.0], [0.0, 1.0], color="0.6", linewidth=1, zorder=0)
         axis.set_title(condition, loc="left", fontsize=10)
         axis.grid(alpha=0.3)
-    return figure, list(zip(axes, conditions, strict=True))
+        for (method, found), colour in zip(methods.items(), _COLOURS, strict=False):
+            points = curve(found[condition])
+            _draw(axis, points, label=method, colour=colour)
+            seen += [number for place, bars in points for number in (place, bars[0])]
+        axis.set_xlabel(labels[0])
+    _look_closer(axes[0], seen, near_zero=near_zero)
+    axes[0].set_ylabel(labels[1])
+    axes[0].legend(fontsize=8, loc="upper left")
+    return encode(figure, "png")
 
 
-def _look_closer(axis: Any, *, high: bool) -> None:
+def _look_closer(axis: Any, points: list[float], *, near_zero: bool) -> None:
     """Let all panels show where points are, near 0 or near 1; intervals may reach beyond."""
-    points = [np.concatenate(bars.lines[0].get_data()) for panel in axis.figure.axes for bars in panel.containers]
-    if not points:
-        return
-    far = float((np.concatenate(points) if high else 1.0 - np.concatenate(points)).max())
-    reach, margin = min(1.0, 1.5 * far + 0.02), 0.02
-    limits = (-margin * reach, reach) if high else (1.0 - reach, 1.0 + margin * reach)
+    far = max((point if near_zero else 1.0 - point for point in points), default=1.0)
+    reach = min(1.0, 1.5 * far + 0.02)
+    limits = (-0.02 * reach, reach) if near_zero else (1.0 - reach, 1.0 + 0.02 * reach)
     axis.set(xlim=limits, ylim=limits)
 
 
-def _draw(axis: Any, x: NDArray[np.float64], rows: NDArray[np.float64], *, label: str, colour: str) -> None:
-    """Draw a line with its intervals; rows hold value, lower and upper bound."""
-    if not len(x):
+def _draw(axis: Any, points: list[tuple[float, list[float]]], *, label: str, colour: str) -> None:
+    """Draw a line with its intervals."""
+    if not points:
         return
-    middle, low, high = rows.T
+    middle, low, high = np.array([bars for _, bars in points]).T
     error = np.nan_to_num(np.stack([middle - low, high - middle])).clip(0.0)
-    axis.errorbar(x, middle, yerr=error, fmt="o-", markersize=3.5, linewidth=1.2, capsize=2, label=label, color=colour)
+    places = [place for place, _ in points]
+    axis.errorbar(
+        places, middle, yerr=error, fmt="o-", markersize=3.5, linewidth=1.2, capsize=2, label=label, color=colour
+    )
