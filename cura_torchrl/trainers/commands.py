@@ -11,7 +11,7 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -147,9 +147,7 @@ def _evaluate(arguments: list[str]) -> None:
         if options.config.method is not None:
             method(options.config.method)
     require_path(options.config.checkpoint)
-    module = load_module("cura_torchrl.trainers.evaluate")
-    with clean_stdout():
-        result = module.evaluate(options.config)
+    result = _run("evaluate", options.config)
     sys.stdout.write(json.dumps(result, indent=2) + "\n" if options.json else as_text(result))
 
 
@@ -164,9 +162,7 @@ def _export(arguments: list[str]) -> None:
     """Write a policy as ONNX and torch.export graphs, with a runner for a robot."""
     config = parse(ExportConfig, "export", arguments)
     require_path(config.checkpoint)
-    module = load_module("cura_torchrl.trainers.export")
-    with clean_stdout():
-        folder = module.export(config)
+    folder = _run("export", config)
     sys.stdout.write(f"{folder}\n")
 
 
@@ -212,54 +208,49 @@ def _imitate(arguments: list[str]) -> None:
 def _demo(arguments: list[str]) -> None:
     """Play the shipped policies on the same scenes, and write a page to look at."""
     config = parse(DemoConfig, "demo", arguments)
-    module = load_module("cura_torchrl.trainers.demo")
-    with clean_stdout():
-        page = module.demo(config)
+    page = _run("demo", config)
     sys.stdout.write(f"{page}\n")
 
 
 def _render(arguments: list[str]) -> None:
     """Play one scene and write the paper's figures of it and animations."""
     config = parse(RenderConfig, "render", arguments)
-    module = load_module("cura_torchrl.trainers.render")
-    with clean_stdout():
-        files = module.render(config)
+    files = _run("render", config)
     sys.stdout.write("".join(f"{file}\n" for file in files))
 
 
 def _table(arguments: list[str]) -> None:
     """Play methods in all cells and write the table of success rates."""
     config = parse(TableConfig, "table", arguments)
-    module = load_module("cura_torchrl.trainers.table")
-    with clean_stdout():
-        page = module.table(config)
+    page = _run("table", config)
     sys.stdout.write(page)
 
 
 def _report(arguments: list[str]) -> None:
     """Write a page about a trained policy, to look at and to send around."""
     config = parse(ReportConfig, "report", arguments)
-    module = load_module("cura_torchrl.trainers.report")
-    with clean_stdout():
-        page = module.report(config)
+    page = _run("report", config)
     sys.stdout.write(f"{page}\n")
 
 
 def _view(arguments: list[str]) -> None:
     """Play scenes in the browser, step by step."""
     config = parse(ViewConfig, "view", arguments)
-    module = load_module("cura_torchrl.trainers.view")
-    with clean_stdout():
-        module.view(config)
+    _run("view", config)
 
 
 def _calibrate(arguments: list[str]) -> None:
     """Compare what the collision estimator predicts with what comes of it."""
     config = parse(CalibrateConfig, "calibrate", arguments)
-    module = load_module("cura_torchrl.trainers.calibrate")
-    with clean_stdout():
-        page = module.calibrate(config)
+    page = _run("calibrate", config)
     sys.stdout.write(page)
+
+
+def _run(name: str, config: Any) -> Any:
+    """Return what the function of this name, in the module of this name, makes of a configuration."""
+    module = load_module(f"cura_torchrl.trainers.{name}")
+    with clean_stdout():
+        return getattr(module, name)(config)
 
 
 def _defaults(arguments: list[str]) -> TrainConfig:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 
 import numpy as np
@@ -45,7 +44,6 @@ def test_lossy_webp_is_nearly_the_same(frames: list[Image.Image]) -> None:
         assert np.asarray(opened.convert("RGB"))[31, 45] == pytest.approx(np.asarray(frames[1])[31, 45], abs=8)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="extra video is not installed")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio leaves the reader's pipes open
 def test_mp4_has_all_frames_and_holds_the_last(frames: list[Image.Image]) -> None:
     """Catches a size that the codec rounds, frames that are lost, and an end that flashes by."""
