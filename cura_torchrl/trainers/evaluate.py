@@ -8,7 +8,7 @@ import sys
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
@@ -21,6 +21,7 @@ from cura_torchrl.envs.robots import scripted
 from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.config import EvaluateConfig
 from cura_torchrl.trainers.episode_measures import EpisodeMeter, Measures
+from cura_torchrl.trainers.evaluation_task import evaluation_task
 from cura_torchrl.trainers.info import git_commit, versions
 from cura_torchrl.trainers.statistics import wilson_interval
 from cura_torchrl.trainers.threads import one_thread
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
 
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
-
-    from cura_torchrl.envs.config import ScenarioKind, TaskConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -349,44 +348,6 @@ def _source(config: EvaluateConfig) -> dict[str, Any]:
         "trained_frames": loaded.record["frames"],
         "trained_commit": loaded.record["commit"],
     }
-
-
-class SceneChoice(Protocol):
-    """What configurations that play evaluation scenes have in common."""
-
-    @property
-    def scenario(self) -> ScenarioKind:
-        """Where obstacles appear."""
-        ...
-
-    @property
-    def object_size(self) -> float:
-        """Edge of the pushed cube [m]."""
-        ...
-
-    @property
-    def max_obstacles(self) -> int:
-        """Most obstacles K in an episode [1]."""
-        ...
-
-
-def evaluation_task(task: TaskConfig, config: SceneChoice) -> TaskConfig:
-    """Return a task with the scenes that are evaluated, and the true obstacles in what is emitted.
-
-    Args:
-        task: What the policy was trained on.
-        config: Scenarios.
-
-    Returns:
-        The task.
-    """
-    scenario = dataclasses.replace(
-        task.scenario, kind=config.scenario, object_edges=(config.object_size,), max_obstacles=config.max_obstacles
-    )
-    # The obstacles are there for meters and pictures; a policy reads them only if it says so.
-    return dataclasses.replace(
-        task, scenario=scenario, stream="eval", random_first_age=False, curriculum=(), privileged=True
-    )
 
 
 def _settings(config: EvaluateConfig) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from cura_torchrl.trainers.animation import animation_frames, frame_numbers
 from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.estimate_figures import appearance_figure, distribution_figure
-from cura_torchrl.trainers.evaluate import evaluation_task
+from cura_torchrl.trainers.evaluation_task import evaluation_task
 from cura_torchrl.trainers.figures import layout_figure, paths_figure, snapshots_figure
 from cura_torchrl.trainers.methods import policy_labels
 from cura_torchrl.trainers.recording import find_scene, record

@@ -16,7 +16,7 @@ from cura_torchrl.trainers.checkpoint import LoadedPolicy, load_policy, progress
 from cura_torchrl.trainers.demo import draw_card
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.estimate_figures import distribution_figure
-from cura_torchrl.trainers.evaluate import evaluation_task
+from cura_torchrl.trainers.evaluation_task import evaluation_task
 from cura_torchrl.trainers.folder_section import read_folder
 from cura_torchrl.trainers.markup import document
 from cura_torchrl.trainers.progress import read_progress

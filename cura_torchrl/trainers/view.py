@@ -18,7 +18,8 @@ from cura_torchrl.trainers import raster
 from cura_torchrl.trainers.animation import map_image
 from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.errors import UnavailableError
-from cura_torchrl.trainers.evaluate import evaluation_task, play_episodes
+from cura_torchrl.trainers.evaluate import play_episodes
+from cura_torchrl.trainers.evaluation_task import evaluation_task
 from cura_torchrl.trainers.recording import Recorder, Recording, find_scene, record
 from cura_torchrl.trainers.threads import one_thread
 from cura_torchrl.trainers.view_config import ViewConfig
