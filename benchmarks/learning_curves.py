@@ -12,7 +12,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from cura_torchrl.trainers.checkpoint import find_checkpoint, load_policy, progress_path
+from cura_torchrl.trainers.checkpoint import find_checkpoint, progress_path
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.methods import PRESETS
 from cura_torchrl.trainers.progress import read_progress
 

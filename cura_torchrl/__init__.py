@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from cura_torchrl.envs.transforms import ConfidenceMap, EncodeMap
     from cura_torchrl.modules import DistributionalCollisionEstimator, MapVAE
     from cura_torchrl.objectives import CURAAdvantage, CURALoss
-    from cura_torchrl.trainers.checkpoint import load_policy
     from cura_torchrl.trainers.gym_registration import register_gym
+    from cura_torchrl.trainers.loaded_policy import load_policy
 
 __version__ = "0.1.0"
 
@@ -31,7 +31,7 @@ _SOURCES = {
     "DistributionalCollisionEstimator": "cura_torchrl.modules",
     "CURAAdvantage": "cura_torchrl.objectives",
     "CURALoss": "cura_torchrl.objectives",
-    "load_policy": "cura_torchrl.trainers.checkpoint",
+    "load_policy": "cura_torchrl.trainers.loaded_policy",
     "register_gym": "cura_torchrl.trainers.gym_registration",
 }
 

@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from recording import KINDS, PERIOD, SIZES, save, share_of, task
 
 from cura_torchrl.trainers.active_perception import LookingMeter
-from cura_torchrl.trainers.checkpoint import LoadedPolicy, load_policy
 from cura_torchrl.trainers.evaluate import Episode, play_episodes, summarise
+from cura_torchrl.trainers.loaded_policy import LoadedPolicy, load_policy
 from cura_torchrl.trainers.statistics import bootstrap_interval
 from cura_torchrl.trainers.threads import one_thread
 

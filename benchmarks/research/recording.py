@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from cura_torchrl.envs.config import TaskConfig
     from cura_torchrl.envs.push import PushEnv
-    from cura_torchrl.trainers.checkpoint import LoadedPolicy
+    from cura_torchrl.trainers.loaded_policy import LoadedPolicy
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 

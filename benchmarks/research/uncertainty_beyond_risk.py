@@ -20,7 +20,7 @@ from cura_torchrl import keys
 from cura_torchrl.envs.robots.scripted import ScriptedPusher
 from cura_torchrl.envs.transforms import ConfidenceMap, EncodeMap
 from cura_torchrl.trainers.build import load_encoder
-from cura_torchrl.trainers.checkpoint import load_policy
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.statistics import bootstrap_interval, correlation
 from cura_torchrl.trainers.threads import one_thread
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
-    from cura_torchrl.trainers.checkpoint import LoadedPolicy
+    from cura_torchrl.trainers.loaded_policy import LoadedPolicy
 
 NEIGHBOURS = 24
 """Samples with the nearest risks that the regression is the mean of [1]."""

@@ -19,8 +19,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from cura_torchrl import keys
 from cura_torchrl.objectives.functional import risk_cost, uncertainty_cost
-from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.cloning import copy_world, vary
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.statistics import bootstrap_interval, correlation
 from cura_torchrl.trainers.threads import one_thread
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
-    from cura_torchrl.trainers.checkpoint import LoadedPolicy
+    from cura_torchrl.trainers.loaded_policy import LoadedPolicy
 
 HOLDS = (1, 5)
 """For how many steps the action is held [1]; costs are summed over them."""

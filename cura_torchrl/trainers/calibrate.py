@@ -19,11 +19,11 @@ from cura_torchrl.trainers.calibration import TAIL, Predictions, measure, realis
 from cura_torchrl.trainers.calibration_config import CONDITIONS, CalibrateConfig
 from cura_torchrl.trainers.calibration_figures import coverage_figure, reliability_figure, truth_figure
 from cura_torchrl.trainers.calibration_report import as_markdown
-from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.evaluate import play_episodes
 from cura_torchrl.trainers.futures import against_truth, horizon, summarise
 from cura_torchrl.trainers.info import provenance
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.statistics import bootstrap_interval
 from cura_torchrl.trainers.threads import one_thread
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from tensordict import TensorDictBase
 
     from cura_torchrl.envs.config import TaskConfig
-    from cura_torchrl.trainers.checkpoint import LoadedPolicy
+    from cura_torchrl.trainers.loaded_policy import LoadedPolicy
 
 _LOOKING = ("seen_ahead_m2", "unseen_ahead", "first_seen_s", "first_seen_m", "beside_m", "object_speed")
 """Measures of looking that are reported; see :class:`~.active_perception.LookingMeter`."""

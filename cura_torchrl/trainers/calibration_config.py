@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from cura_torchrl.envs.config import Simulator, require, require_finite
 from cura_torchrl.trainers.info import shipped_methods
-from cura_torchrl.trainers.lists import split_names
+from cura_torchrl.trainers.lists import require_known, split_names
 
 CONDITIONS: dict[str, dict[str, Any]] = {
     "on-policy": {},
@@ -57,10 +56,10 @@ class CalibrateConfig:
             object.__setattr__(self, name, split_names(getattr(self, name)))
             require(bool(getattr(self, name)), name, getattr(self, name), "one or more")
         for name in self.methods:
-            known = name in shipped_methods() or Path(name).exists()
-            require(known, "method", name, _accepted(name, shipped_methods()) + ", or the folder of a run")
+            if not Path(name).exists():
+                require_known("method", name, shipped_methods(), otherwise=", or the folder of a run")
         for name in self.conditions:
-            require(name in CONDITIONS, "condition", name, _accepted(name, list(CONDITIONS)))
+            require_known("condition", name, CONDITIONS)
         require(self.candidates >= 1000, "candidates", self.candidates, "1000 or more, for few may agree")
         for name in ("episodes", "futures", "repeats", "chunk"):
             require(getattr(self, name) > 0, name, getattr(self, name), "1 or more")
@@ -70,8 +69,3 @@ class CalibrateConfig:
             fits, "repeats", self.repeats, f"a divisor of {self.futures} futures, with 2 groups or more of 2 or more"
         )
         require(0 <= self.seed < 2**31, "seed", self.seed, "0 to 2147483647")
-
-
-def _accepted(name: str, names: list[str]) -> str:
-    close = difflib.get_close_matches(name, names, n=1)
-    return ", ".join(names) + (f" (did you mean {close[0]}?)" if close else "")

@@ -7,34 +7,25 @@ form without optimisers.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import logging
 import os
 import shutil
 import uuid
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, StateDictCheckpointAdapter
 
-from cura_torchrl.trainers.build import Networks, make_env
 from cura_torchrl.trainers.config import TrainConfig
 from cura_torchrl.trainers.errors import CheckpointError
-from cura_torchrl.trainers.info import git_commit, shipped_methods, versions
-from cura_torchrl.trainers.methods import PRESETS
+from cura_torchrl.trainers.info import git_commit, versions
 from cura_torchrl.trainers.progress import PROGRESS_NAME
 from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from torchrl.envs import EnvBase
-
-    from cura_torchrl.envs.config import Simulator, TaskConfig
+    from pathlib import Path
 
 logger = logging.getLogger(__name__)
 
@@ -42,8 +33,6 @@ CONFIG_NAME = "config.json"
 """File of a checkpoint with the resolved configuration and where it came from."""
 SUMS_NAME = "SHA256SUMS"
 """File of a checkpoint with the hash of every other file, in the format of ``sha256sum``."""
-SHIPPED_FOLDER = Path(__file__).parent / "weights"
-"""Folder of the weights that come with the package, one folder a method."""
 _PREFIX = "checkpoint"
 _STAGE_PREFIX = ".stage-"
 
@@ -199,110 +188,16 @@ def restore(path: Path, components: Mapping[str, Any]) -> None:
         raise CheckpointError(msg) from None
 
 
-@dataclass(frozen=True, kw_only=True)
-class LoadedPolicy:
-    """Trained networks with all that is needed to run them."""
-
-    policy: ProbabilisticTensorDictSequential
-    """Actor; under TorchRL's ``ExplorationType.DETERMINISTIC`` it returns its mean."""
-    critic: TensorDictModule
-    """State value."""
-    collision_estimator: TensorDictModule
-    """Distribution of the collision possibility, risk and uncertainty."""
-    config: TrainConfig
-    """What the networks were trained with."""
-    record: dict[str, Any]
-    """Content of ``config.json``: frames, seed, versions, commit."""
-    path: Path
-    """Where the networks came from."""
-
-    @property
-    def weights_sha256(self) -> str:
-        """SHA-256 of the checkpoint's list of hashes: what tells these weights from others."""
-        return _sha256(self.path / SUMS_NAME)
-
-    def make_env(
-        self,
-        num_envs: int,
-        *,
-        task: TaskConfig | None = None,
-        simulator: Simulator | None = None,
-        keep_map: bool = False,
-        **options: Any,
-    ) -> EnvBase:
-        """Return the environment that the policy was trained for, on the frozen evaluation scenarios.
-
-        Args:
-            num_envs: Number of worlds N.
-            task: Task to play; None is the trained one with all its obstacles.
-            simulator: Where to play; None is where the policy was trained.
-            keep_map: Whether the window of the map stays in the tensordict under ``confidence_map``.
-            **options: Keyword arguments of :class:`~cura_torchrl.envs.push.PushEnv`, such as ``seed``.
-
-        Returns:
-            The environment with its transforms.
-        """
-        played = self.config.env.task if task is None else task
-        played = dataclasses.replace(played, stream="eval", random_first_age=False, curriculum=())
-        where = simulator or self.config.simulator
-        env = dataclasses.replace(self.config.env, task=played, simulator=where)
-        config = self.config.replace(env=env, simulator=where)
-        return make_env(config, num_envs, keep_map=keep_map, **options)
-
-
-def load_policy(source: str | Path) -> LoadedPolicy:
-    """Load trained networks.
+def weights_sha256(path: Path) -> str:
+    """Return what tells a checkpoint's weights from others.
 
     Args:
-        source: Name of a method whose weights are shipped, or the path of a run or checkpoint.
+        path: The checkpoint's folder.
 
     Returns:
-        Networks in evaluation mode on the CPU, and their configuration.
-
-    Raises:
-        CheckpointError: If there is no such method or path, or the checkpoint is damaged.
-    """  # noqa: DOC502 - raised by what this calls
-    path = find_checkpoint(_resolve(source))
-    config, record = read_config(path)
-    networks = Networks(config)
-    restore(path, {"networks": networks})
-    networks.requires_grad_(False).eval()
-    return LoadedPolicy(
-        policy=networks.actor,
-        critic=networks.critic,
-        collision_estimator=networks.collision_network,
-        config=config,
-        record=record,
-        path=path,
-    )
-
-
-def export_policy(source: Path, destination: Path | None = None) -> Path:
-    """Write a run's newest networks, without optimisers, as weights are shipped, and its curve beside them.
-
-    Args:
-        source: A run or a checkpoint.
-        destination: Folder to write; None is the package's own folder for the method.
-
-    Returns:
-        The folder that was written.
-
-    Raises:
-        CheckpointError: If there is no checkpoint or it is damaged.
-    """  # noqa: DOC502 - raised by what this calls
-    path = find_checkpoint(source)
-    config, record = read_config(path)
-    networks = Networks(config)
-    restore(path, {"networks": networks})
-    folder = SHIPPED_FOLDER / config.method if destination is None else destination
-    # Paths of the machine that trained say nothing elsewhere.
-    released = config.replace(run_dir=Path("runs") / config.method, encoder=None)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    curve = progress_path(path)
-    if curve.exists():
-        shutil.copyfile(curve, progress_path(folder))
-    origin = {name: record[name] for name in ("versions", "commit")}
-    return write_checkpoint({"networks": networks}, released, folder, frames=record["frames"], origin=origin)
+        SHA-256 of the checkpoint's list of hashes.
+    """
+    return _sha256(path / SUMS_NAME)
 
 
 def progress_path(checkpoint: Path) -> Path:
@@ -315,6 +210,7 @@ def progress_path(checkpoint: Path) -> Path:
         File of the run's folder, or, for shipped weights, the file beside their folder; it need not exist.
 
     Examples:
+        >>> from pathlib import Path
         >>> progress_path(Path("runs/a/checkpoints/checkpoint-1")).as_posix()
         'runs/a/progress.csv'
         >>> progress_path(Path("weights/push")).as_posix()
@@ -323,21 +219,6 @@ def progress_path(checkpoint: Path) -> Path:
     if checkpoint.parent.name == CHECKPOINT_FOLDER:
         return checkpoint.parents[1] / PROGRESS_NAME
     return checkpoint.with_name(f"{checkpoint.name}-{PROGRESS_NAME}")
-
-
-def _resolve(source: str | Path) -> Path:
-    if isinstance(source, str) and source in PRESETS:
-        shipped = SHIPPED_FOLDER / source
-        if not shipped.exists():
-            available = ", ".join(shipped_methods()) or "none"
-            msg = f"no weights of method {source!r} are shipped; accepted: {available}, or the path of a checkpoint"
-            raise CheckpointError(msg)
-        return shipped
-    path = Path(source)
-    if not path.exists():
-        msg = f"no checkpoint at {source}; accepted: the path of a run or checkpoint, or one of {', '.join(PRESETS)}"
-        raise CheckpointError(msg)
-    return path
 
 
 def _coordinator(components: Mapping[str, Any]) -> Checkpoint:

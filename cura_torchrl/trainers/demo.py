@@ -20,12 +20,13 @@ from tqdm import tqdm
 
 from cura_torchrl.trainers import animation, figures
 from cura_torchrl.trainers.build import load_encoder
-from cura_torchrl.trainers.checkpoint import load_policy, progress_path
+from cura_torchrl.trainers.checkpoint import progress_path
 from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError, UnavailableError
 from cura_torchrl.trainers.estimate_figures import distribution_figure
 from cura_torchrl.trainers.evaluate import summarise
 from cura_torchrl.trainers.info import git_commit, hardware, shipped_methods, versions
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.methods import PRESETS, policy_labels
 from cura_torchrl.trainers.page import Card, make_page
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
@@ -40,8 +41,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from cura_torchrl.envs.config import TaskConfig
-    from cura_torchrl.trainers.checkpoint import LoadedPolicy
     from cura_torchrl.trainers.config import TrainConfig
+    from cura_torchrl.trainers.loaded_policy import LoadedPolicy
     from cura_torchrl.trainers.recording import Scene
 
 __all__ = ["DemoConfig", "demo"]

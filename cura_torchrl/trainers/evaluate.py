@@ -18,11 +18,11 @@ from cura_torchrl import keys
 from cura_torchrl.envs.config import PushEnvConfig, RobotConfig
 from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.envs.robots import scripted
-from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.config import EvaluateConfig
 from cura_torchrl.trainers.episode_measures import EpisodeMeter, Measures
 from cura_torchrl.trainers.evaluation_task import evaluation_task
 from cura_torchrl.trainers.info import git_commit, versions
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.statistics import wilson_interval
 from cura_torchrl.trainers.threads import one_thread
 from cura_torchrl.trainers.worker_pool import count_one, in_processes

@@ -27,9 +27,9 @@ from tqdm import tqdm
 from cura_torchrl import keys
 from cura_torchrl.envs.transforms import ConfidenceMap
 from cura_torchrl.trainers.build import load_encoder
-from cura_torchrl.trainers.checkpoint import LoadedPolicy, load_policy
 from cura_torchrl.trainers.errors import CheckpointError, RunError, UnavailableError
 from cura_torchrl.trainers.export_description import Signal, describe, map_signals, policy_signals
+from cura_torchrl.trainers.loaded_policy import LoadedPolicy, load_policy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

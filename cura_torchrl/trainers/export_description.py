@@ -12,8 +12,8 @@ from cura_torchrl.trainers.info import git_commit, versions
 if TYPE_CHECKING:
     from cura_torchrl.envs.config import RobotConfig
     from cura_torchrl.envs.transforms import ConfidenceMap
-    from cura_torchrl.trainers.checkpoint import LoadedPolicy
     from cura_torchrl.trainers.config import TrainConfig
+    from cura_torchrl.trainers.loaded_policy import LoadedPolicy
 
 OBSERVATION_PARTS: dict[str, tuple[str, str]] = {
     "tcp_position": ("m", "TCP relative to the base"),

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from cura_torchrl.envs.config import TaskConfig
     from cura_torchrl.trainers.calibration_config import CalibrateConfig
-    from cura_torchrl.trainers.checkpoint import LoadedPolicy
+    from cura_torchrl.trainers.loaded_policy import LoadedPolicy
 
 _WORLDS = 24
 """Worlds in which the states are reached [1]."""

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from cura_torchrl.envs.config import MapConfig, PushEnvConfig, RobotName
 from cura_torchrl.trainers.config import CURAConfig, RiskMeasureKind, TrainConfig, UncertaintyKind
+from cura_torchrl.trainers.lists import require_known
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from cura_torchrl.trainers.checkpoint import LoadedPolicy
+    from cura_torchrl.trainers.loaded_policy import LoadedPolicy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,12 +93,8 @@ def method(name: str) -> TrainConfig:
         1.0
         >>> method("cura-ppo").cura.uncertainty_coeff
         0.25
-    """
-    if name not in PRESETS:
-        close = difflib.get_close_matches(name, PRESETS, n=1)
-        hint = f" (did you mean {close[0]}?)" if close else ""
-        msg = f"method is {name!r}{hint}; accepted: {', '.join(PRESETS)}"
-        raise ValueError(msg)
+    """  # noqa: DOC502 - raised by what this calls
+    require_known("method", name, PRESETS)
     preset = PRESETS[name]
     env = PushEnvConfig()
     return TrainConfig(

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from cura_torchrl.trainers.animation import animation_frames, frame_numbers
-from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.estimate_figures import appearance_figure, distribution_figure
 from cura_torchrl.trainers.evaluation_task import evaluation_task
 from cura_torchrl.trainers.figures import layout_figure, paths_figure, snapshots_figure
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.methods import policy_labels
 from cura_torchrl.trainers.recording import find_scene, record
 from cura_torchrl.trainers.render_config import RenderConfig
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
     from cura_torchrl.envs.config import TaskConfig
-    from cura_torchrl.trainers.checkpoint import LoadedPolicy
+    from cura_torchrl.trainers.loaded_policy import LoadedPolicy
     from cura_torchrl.trainers.recording import Recording
     from cura_torchrl.trainers.render_config import FigureName, StillFormat
 

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 from cura_torchrl.envs.config import ScenarioKind, Simulator, require, require_finite
 from cura_torchrl.trainers.info import shipped_methods
-from cura_torchrl.trainers.lists import split_names
+from cura_torchrl.trainers.lists import require_known, split_names
 
 FigureName = Literal["paths", "snapshots", "distribution", "appearance", "layout"]
 """Figures of the paper: paths; paths with maps; the DCE's distribution; how an obstacle appears; the environment."""
@@ -85,15 +85,14 @@ class RenderConfig:
     def _require_names(self) -> None:
         require(1 <= len(self.methods) <= 4, "methods", self.methods, "1 to 4 methods")
         for name in self.methods:
-            known = shipped_methods()
-            accepted = f"{', '.join(known)}, or the folder of a run or checkpoint"
-            require(name in known or Path(name).is_dir(), "method", name, accepted)
+            if not Path(name).is_dir():
+                require_known("method", name, shipped_methods(), otherwise=", or the folder of a run or checkpoint")
         for name in self.figures:
-            require(name in {*FIGURES, "all", "none"}, "figure", name, f"all, none, {', '.join(FIGURES)}")
+            require_known("figure", name, ("all", "none", *FIGURES))
         known_formats = (*STILL_FORMATS, *ANIMATION_FORMATS)
         require(bool(self.formats), "formats", self.formats, f"one or more of {', '.join(known_formats)}")
         for name in self.formats:
-            require(name in known_formats, "format", name, ", ".join(known_formats))
+            require_known("format", name, known_formats)
 
     @property
     def drawn(self) -> tuple[FigureName, ...]:

@@ -12,12 +12,13 @@ from tqdm import tqdm
 
 from cura_torchrl.trainers import figures, report_page
 from cura_torchrl.trainers.build import load_encoder
-from cura_torchrl.trainers.checkpoint import LoadedPolicy, load_policy, progress_path
+from cura_torchrl.trainers.checkpoint import progress_path
 from cura_torchrl.trainers.demo import draw_card
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.estimate_figures import distribution_figure
 from cura_torchrl.trainers.evaluation_task import evaluation_task
 from cura_torchrl.trainers.folder_section import read_folder
+from cura_torchrl.trainers.loaded_policy import LoadedPolicy, load_policy
 from cura_torchrl.trainers.markup import document
 from cura_torchrl.trainers.progress import read_progress
 from cura_torchrl.trainers.recording import find_scene, record

@@ -19,8 +19,8 @@ from cura_torchrl.trainers.page import HOW_TO_READ, Card, scene_article
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from cura_torchrl.trainers.checkpoint import LoadedPolicy
     from cura_torchrl.trainers.curves import Rows
+    from cura_torchrl.trainers.loaded_policy import LoadedPolicy
     from cura_torchrl.trainers.report_config import ReportConfig
 
 _INTRODUCTION = (

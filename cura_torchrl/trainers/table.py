@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from cura_torchrl.trainers.agreement import agreement, pair
-from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.config import EvaluateConfig
 from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
 from cura_torchrl.trainers.evaluate import Episode, Part, parts_of, play_parts
 from cura_torchrl.trainers.info import git_commit, versions
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.outcomes import SHIPPED, CodeRecord, OutcomeStore, PolicyRecord, Scenes
 from cura_torchrl.trainers.table_config import CHUNKS, TableConfig, parse_cell
 from cura_torchrl.trainers.table_figure import table_figure

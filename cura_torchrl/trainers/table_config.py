@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast, get_args
 
 from cura_torchrl.envs.config import ScenarioKind, Simulator, require, require_finite
 from cura_torchrl.trainers.info import shipped_methods
-from cura_torchrl.trainers.lists import Numbers, split_names
+from cura_torchrl.trainers.lists import Numbers, require_known, split_names
 from cura_torchrl.trainers.methods import PRESETS
 from cura_torchrl.trainers.paper_table import PAPER_CELLS
 
@@ -100,11 +99,9 @@ class TableConfig:
         object.__setattr__(self, "cells", tuple(cell.name for cell in _cells(split_names(self.cells))))
         require(bool(self.methods), "methods", self.methods, "one or more methods")
         require(bool(self.cells), "cells", self.cells, _CELL_NAMES)
-        accepted = tuple(PRESETS) if self.seeds else tuple(shipped_methods())
+        known = tuple(PRESETS) if self.seeds else tuple(shipped_methods())
         for name in self.methods:
-            close = difflib.get_close_matches(name, accepted, n=1)
-            hint = f" (did you mean {close[0]}?)" if close else ""
-            require(name in accepted, "method", name, ", ".join(accepted) + hint)
+            require_known("method", name, known)
         require(0 <= self.max_obstacles <= 6, "max_obstacles", self.max_obstacles, "0 to 6")
         for field in ("episodes", "num_workers", "side_by_side"):
             require(getattr(self, field) > 0, field.replace("side_by_side", "chunk"), getattr(self, field), "1 or more")

@@ -14,13 +14,7 @@ import torch
 from torchrl.checkpoint import GlobalRNGState
 
 from cura_torchrl.trainers.build import Networks, build_collector
-from cura_torchrl.trainers.checkpoint import (
-    find_checkpoint,
-    read_config,
-    restore,
-    save_checkpoint,
-    sweep,
-)
+from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, restore, save_checkpoint, sweep
 from cura_torchrl.trainers.diagnostics import (
     RecentEpisodes,
     finished_episodes,

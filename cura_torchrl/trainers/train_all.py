@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import re
 import shlex
@@ -15,7 +14,7 @@ import time
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Any
 
-from cura_torchrl.trainers.checkpoint import SUMS_NAME, find_checkpoint, read_config
+from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, weights_sha256
 from cura_torchrl.trainers.decoding import encode
 from cura_torchrl.trainers.errors import CheckpointError, Interrupted
 from cura_torchrl.trainers.info import hardware
@@ -71,7 +70,7 @@ def train_all(
         Interrupted: If SIGINT, SIGTERM or SIGHUP asked to stop; the runs have stopped with a checkpoint.
     """  # noqa: DOC502 - raised by what this calls
     paths = {run.init_from for run in runs if run.init_from is not None}
-    starts = {path: _weights_sha256(find_checkpoint(path)) for path in paths}
+    starts = {path: weights_sha256(find_checkpoint(path)) for path in paths}
     for run in runs:
         _require_same(run, starts)
     jobs = config.jobs or default_jobs(runs[0].config, hardware()["cores"])
@@ -309,10 +308,6 @@ def _machine_flags(config: TrainConfig) -> Iterator[str]:
             yield prefix + (name if value else f"no-{name}")
         else:
             yield from (prefix + name, str(value))
-
-
-def _weights_sha256(checkpoint: Path) -> str:
-    return hashlib.sha256((checkpoint / SUMS_NAME).read_bytes()).hexdigest()
 
 
 def _end_group(pid: int) -> None:

@@ -16,10 +16,10 @@ from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
 from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.trainers import raster
 from cura_torchrl.trainers.animation import map_image
-from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.errors import UnavailableError
 from cura_torchrl.trainers.evaluate import play_episodes
 from cura_torchrl.trainers.evaluation_task import evaluation_task
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.recording import Recorder, Recording, find_scene, record
 from cura_torchrl.trainers.threads import one_thread
 from cura_torchrl.trainers.view_config import ViewConfig
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
-    from cura_torchrl.trainers.checkpoint import LoadedPolicy
+    from cura_torchrl.trainers.loaded_policy import LoadedPolicy
     from cura_torchrl.trainers.recording import Scene
 
 __all__ = ["ViewConfig", "view"]

@@ -5,22 +5,7 @@ from __future__ import annotations
 import pytest
 
 from cura_torchrl.trainers.agreement import agreement, pair
-from cura_torchrl.trainers.evaluate import Episode
-
-
-def run_of(letters: str, first: int = 0) -> list[Episode]:
-    """Episodes with these outcomes, from a scene on."""
-    return [
-        Episode(
-            index=first + index,
-            success=(letter == "s", False, False),
-            collision=letter == "c",
-            contact=(False, letter == "c", False),
-            tipped=False,
-            steps=9,
-        )
-        for index, letter in enumerate(letters)
-    ]
+from tests.episodes import run_of
 
 
 def test_scenes_are_paired_by_index_and_count_as_alike_by_how_they_end() -> None:

@@ -10,23 +10,17 @@ import pytest
 import torch
 from torch import nn
 
-from cura_torchrl.trainers import checkpoint as module
-from cura_torchrl.trainers.build import Networks
 from cura_torchrl.trainers.checkpoint import (
     CHECKPOINT_FOLDER,
-    export_policy,
     find_checkpoint,
-    load_policy,
     progress_path,
     read_config,
     restore,
     save_checkpoint,
     sweep,
-    verify,
 )
 from cura_torchrl.trainers.errors import CheckpointError
 from cura_torchrl.trainers.methods import method
-from cura_torchrl.trainers.progress import PROGRESS_NAME
 
 
 def save(folder: Path, frames: int, **options: int) -> tuple[Path, nn.Module]:
@@ -173,89 +167,6 @@ def test_a_configuration_that_does_not_fit_names_its_key(saved: Path) -> None:
     (saved / "config.json").write_text(json.dumps(record), encoding="utf-8")
     with pytest.raises(CheckpointError, match=r"ppo\.colour is an unknown key"):
         read_config(saved)
-
-
-def test_exported_weights_say_what_trained_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches weights that name the commit of their release, from which nobody can make them again."""
-    config = method("push").replace(run_dir=tmp_path / "run", perception="none")
-    monkeypatch.setattr(module, "git_commit", lambda: "of the training")
-    save_checkpoint({"networks": Networks(config)}, config, tmp_path / "run" / CHECKPOINT_FOLDER, frames=7)
-    (tmp_path / "run" / PROGRESS_NAME).write_text("frames\n7\n", encoding="utf-8")
-    monkeypatch.setattr(module, "git_commit", lambda: "of the release")
-    released = export_policy(tmp_path / "run", tmp_path / "release" / "push")
-    assert read_config(released)[1]["commit"] == "of the training"
-    curve = tmp_path / "release" / f"push-{PROGRESS_NAME}"
-    assert curve.read_text(encoding="utf-8") == "frames\n7\n"
-
-
-def test_exported_weights_load_by_path_and_act_alike(tmp_path: Path) -> None:
-    """Catches a release without the normalisation's statistics, which acts otherwise than the run did."""
-    config = method("push").replace(run_dir=tmp_path / "run", perception="none")
-    networks = Networks(config)
-    networks.observation_norm.update(torch.randn(50, networks.observation_norm.mean.shape[0]) * 3 + 1)
-    save_checkpoint({"networks": networks, "counters": nn.Linear(1, 1)}, config, tmp_path / "run", frames=7)
-    loaded = load_policy(export_policy(tmp_path / "run", tmp_path / "release" / "push"))
-    inputs = {"observation": torch.randn(4, 33), "latent": torch.randn(4, 32)}
-    for ours, theirs in (
-        (networks.actor.module[0], loaded.policy.module[0]),
-        (networks.critic, loaded.critic),
-        (networks.collision_estimator, loaded.collision_estimator),
-    ):
-        for mine, its in zip(_outputs(ours(**inputs)), _outputs(theirs(**inputs)), strict=True):
-            assert torch.equal(mine, its)
-    assert loaded.record["frames"] == 7
-    assert loaded.config.run_dir == Path("runs/push")
-    assert not any(parameter.requires_grad for parameter in loaded.policy.parameters())
-    verify(loaded.path)
-
-
-def test_a_policy_plays_on_either_simulator_whatever_it_was_trained_on(tmp_path: Path) -> None:
-    """Catches an evaluation that plays where the policy was trained, not where it was asked to."""
-    config = method("push").replace(run_dir=tmp_path / "run", perception="none", simulator="planar")
-    save_checkpoint({"networks": Networks(config)}, config, tmp_path / "run", frames=1)
-    loaded = load_policy(tmp_path / "run")
-    for asked, played in ((None, "planar"), ("bullet", "bullet"), ("planar", "planar")):
-        env = loaded.make_env(1, simulator=asked)
-        assert env.base_env.config.simulator == played
-        assert env.base_env.config.task.stream == "eval"
-        env.close()
-
-
-@pytest.mark.parametrize("name", ["cura-cvar", "cura-perceptual"])
-def test_methods_beyond_the_paper_play_without_what_they_were_trained_with(tmp_path: Path, name: str) -> None:
-    """Catches an evaluation that needs the true obstacles, or reads another risk than the policy was trained by."""
-    config = method(name).replace(run_dir=tmp_path / "run", perception="none", simulator="planar")
-    save_checkpoint({"networks": Networks(config)}, config, tmp_path / "run", frames=1)
-    loaded = load_policy(tmp_path / "run")
-    env = loaded.make_env(2)
-    try:
-        played = env.rollout(2, loaded.policy)
-    finally:
-        env.close()
-    assert not {"obstacle_code", "obstacles"} & set(played.keys())
-    outputs = loaded.collision_estimator(played.select("observation", "latent"))
-    atoms = outputs["collision_atoms"].clamp(0, 1).sort(-1, descending=True).values
-    # The largest quarter of 50 atoms: 12 and half of the next.
-    tail = (atoms[..., :12].sum(-1) + 0.5 * atoms[..., 12]) / 12.5
-    expected = tail if name == "cura-cvar" else outputs["collision_atoms"].mean(-1)
-    torch.testing.assert_close(outputs["risk"].squeeze(-1), expected)
-
-
-def _outputs(value: torch.Tensor | tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
-    return value if isinstance(value, tuple) else (value,)
-
-
-def test_a_method_without_shipped_weights_and_a_wrong_path_are_told_apart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Catches a wrong name that reads as a damaged installation."""
-    monkeypatch.setattr(module, "SHIPPED_FOLDER", tmp_path)
-    with pytest.raises(CheckpointError, match="no weights of method 'push' are shipped"):
-        load_policy("push")
-    with pytest.raises(CheckpointError, match="no checkpoint at nowhere; accepted: the path of a run or checkpoint"):
-        load_policy("nowhere")
-    with pytest.raises(CheckpointError, match="no checkpoint at"):
-        load_policy(tmp_path)
 
 
 def test_progress_lies_in_the_run_or_beside_shipped_weights() -> None:

@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 
 from cura_torchrl.trainers import render as render_module
-from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.config import EvaluateConfig
 from cura_torchrl.trainers.errors import UnavailableError
 from cura_torchrl.trainers.evaluate import evaluate, outcome_letter
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.render import play_scene, render
 from cura_torchrl.trainers.render_config import FIGURES, RenderConfig
 from tests.recordings import make_recording

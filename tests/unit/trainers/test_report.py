@@ -14,8 +14,8 @@ from PIL import Image
 from cura_torchrl.envs.config import ScenarioConfig
 from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.trainers import report as report_module
-from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.errors import RunError
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.recording import choose_scenes, find_scene
 from cura_torchrl.trainers.report import ReportConfig, report
 from tests.pages import Reader

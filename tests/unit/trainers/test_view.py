@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from cura_torchrl.trainers import view as view_module
-from cura_torchrl.trainers.checkpoint import load_policy
 from cura_torchrl.trainers.errors import UnavailableError
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.view import View, ViewConfig, play_scene
 from tests.recordings import make_recording
 from tests.runs import tiny_run

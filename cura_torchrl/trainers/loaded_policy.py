@@ -1,0 +1,154 @@
+"""Trained networks with all that is needed to run them: loaded from a checkpoint, or written as shipped weights are."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+
+from cura_torchrl.trainers.build import Networks, make_env
+from cura_torchrl.trainers.checkpoint import (
+    find_checkpoint,
+    progress_path,
+    read_config,
+    restore,
+    weights_sha256,
+    write_checkpoint,
+)
+from cura_torchrl.trainers.config import TrainConfig
+from cura_torchrl.trainers.errors import CheckpointError
+from cura_torchrl.trainers.info import shipped_methods
+from cura_torchrl.trainers.methods import PRESETS
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+    from cura_torchrl.envs.config import Simulator, TaskConfig
+
+SHIPPED_FOLDER = Path(__file__).parent / "weights"
+"""Folder of the weights that come with the package, one folder a method."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadedPolicy:
+    """Trained networks with all that is needed to run them."""
+
+    policy: ProbabilisticTensorDictSequential
+    """Actor; under TorchRL's ``ExplorationType.DETERMINISTIC`` it returns its mean."""
+    critic: TensorDictModule
+    """State value."""
+    collision_estimator: TensorDictModule
+    """Distribution of the collision possibility, risk and uncertainty."""
+    config: TrainConfig
+    """What the networks were trained with."""
+    record: dict[str, Any]
+    """Content of ``config.json``: frames, seed, versions, commit."""
+    path: Path
+    """Where the networks came from."""
+
+    @property
+    def weights_sha256(self) -> str:
+        """SHA-256 that tells these weights from others."""
+        return weights_sha256(self.path)
+
+    def make_env(
+        self,
+        num_envs: int,
+        *,
+        task: TaskConfig | None = None,
+        simulator: Simulator | None = None,
+        keep_map: bool = False,
+        **options: Any,
+    ) -> EnvBase:
+        """Return the environment that the policy was trained for, on the frozen evaluation scenarios.
+
+        Args:
+            num_envs: Number of worlds N.
+            task: Task to play; None is the trained one with all its obstacles.
+            simulator: Where to play; None is where the policy was trained.
+            keep_map: Whether the window of the map stays in the tensordict under ``confidence_map``.
+            **options: Keyword arguments of :class:`~cura_torchrl.envs.push.PushEnv`, such as ``seed``.
+
+        Returns:
+            The environment with its transforms.
+        """
+        played = self.config.env.task if task is None else task
+        played = dataclasses.replace(played, stream="eval", random_first_age=False, curriculum=())
+        where = simulator or self.config.simulator
+        env = dataclasses.replace(self.config.env, task=played, simulator=where)
+        config = self.config.replace(env=env, simulator=where)
+        return make_env(config, num_envs, keep_map=keep_map, **options)
+
+
+def load_policy(source: str | Path) -> LoadedPolicy:
+    """Load trained networks.
+
+    Args:
+        source: Name of a method whose weights are shipped, or the path of a run or checkpoint.
+
+    Returns:
+        Networks in evaluation mode on the CPU, and their configuration.
+
+    Raises:
+        CheckpointError: If there is no such method or path, or the checkpoint is damaged.
+    """  # noqa: DOC502 - raised by what this calls
+    path = find_checkpoint(_resolve(source))
+    config, record = read_config(path)
+    networks = Networks(config)
+    restore(path, {"networks": networks})
+    networks.requires_grad_(False).eval()
+    return LoadedPolicy(
+        policy=networks.actor,
+        critic=networks.critic,
+        collision_estimator=networks.collision_network,
+        config=config,
+        record=record,
+        path=path,
+    )
+
+
+def export_policy(source: Path, destination: Path | None = None) -> Path:
+    """Write a run's newest networks, without optimisers, as weights are shipped, and its curve beside them.
+
+    Args:
+        source: A run or a checkpoint.
+        destination: Folder to write; None is the package's own folder for the method.
+
+    Returns:
+        The folder that was written.
+
+    Raises:
+        CheckpointError: If there is no checkpoint or it is damaged.
+    """  # noqa: DOC502 - raised by what this calls
+    path = find_checkpoint(source)
+    config, record = read_config(path)
+    networks = Networks(config)
+    restore(path, {"networks": networks})
+    folder = SHIPPED_FOLDER / config.method if destination is None else destination
+    # Paths of the machine that trained say nothing elsewhere.
+    released = config.replace(run_dir=Path("runs") / config.method, encoder=None)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    curve = progress_path(path)
+    if curve.exists():
+        shutil.copyfile(curve, progress_path(folder))
+    origin = {name: record[name] for name in ("versions", "commit")}
+    return write_checkpoint({"networks": networks}, released, folder, frames=record["frames"], origin=origin)
+
+
+def _resolve(source: str | Path) -> Path:
+    if isinstance(source, str) and source in PRESETS:
+        shipped = SHIPPED_FOLDER / source
+        if not shipped.exists():
+            available = ", ".join(shipped_methods()) or "none"
+            msg = f"no weights of method {source!r} are shipped; accepted: {available}, or the path of a checkpoint"
+            raise CheckpointError(msg)
+        return shipped
+    path = Path(source)
+    if not path.exists():
+        msg = f"no checkpoint at {source}; accepted: the path of a run or checkpoint, or one of {', '.join(PRESETS)}"
+        raise CheckpointError(msg)
+    return path

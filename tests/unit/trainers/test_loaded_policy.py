@@ -1,0 +1,100 @@
+"""Networks come back from a checkpoint or from shipped weights, and play where they are asked to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from cura_torchrl.trainers import checkpoint, loaded_policy
+from cura_torchrl.trainers.build import Networks
+from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, read_config, save_checkpoint, verify
+from cura_torchrl.trainers.errors import CheckpointError
+from cura_torchrl.trainers.loaded_policy import export_policy, load_policy
+from cura_torchrl.trainers.methods import method
+from cura_torchrl.trainers.progress import PROGRESS_NAME
+
+
+def test_exported_weights_say_what_trained_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches weights that name the commit of their release, from which nobody can make them again."""
+    config = method("push").replace(run_dir=tmp_path / "run", perception="none")
+    monkeypatch.setattr(checkpoint, "git_commit", lambda: "of the training")
+    save_checkpoint({"networks": Networks(config)}, config, tmp_path / "run" / CHECKPOINT_FOLDER, frames=7)
+    (tmp_path / "run" / PROGRESS_NAME).write_text("frames\n7\n", encoding="utf-8")
+    monkeypatch.setattr(checkpoint, "git_commit", lambda: "of the release")
+    released = export_policy(tmp_path / "run", tmp_path / "release" / "push")
+    assert read_config(released)[1]["commit"] == "of the training"
+    curve = tmp_path / "release" / f"push-{PROGRESS_NAME}"
+    assert curve.read_text(encoding="utf-8") == "frames\n7\n"
+
+
+def test_exported_weights_load_by_path_and_act_alike(tmp_path: Path) -> None:
+    """Catches a release without the normalisation's statistics, which acts otherwise than the run did."""
+    config = method("push").replace(run_dir=tmp_path / "run", perception="none")
+    networks = Networks(config)
+    networks.observation_norm.update(torch.randn(50, networks.observation_norm.mean.shape[0]) * 3 + 1)
+    save_checkpoint({"networks": networks, "counters": nn.Linear(1, 1)}, config, tmp_path / "run", frames=7)
+    loaded = load_policy(export_policy(tmp_path / "run", tmp_path / "release" / "push"))
+    inputs = {"observation": torch.randn(4, 33), "latent": torch.randn(4, 32)}
+    for ours, theirs in (
+        (networks.actor.module[0], loaded.policy.module[0]),
+        (networks.critic, loaded.critic),
+        (networks.collision_estimator, loaded.collision_estimator),
+    ):
+        for mine, its in zip(_outputs(ours(**inputs)), _outputs(theirs(**inputs)), strict=True):
+            assert torch.equal(mine, its)
+    assert loaded.record["frames"] == 7
+    assert loaded.config.run_dir == Path("runs/push")
+    assert not any(parameter.requires_grad for parameter in loaded.policy.parameters())
+    verify(loaded.path)
+
+
+def test_a_policy_plays_on_either_simulator_whatever_it_was_trained_on(tmp_path: Path) -> None:
+    """Catches an evaluation that plays where the policy was trained, not where it was asked to."""
+    config = method("push").replace(run_dir=tmp_path / "run", perception="none", simulator="planar")
+    save_checkpoint({"networks": Networks(config)}, config, tmp_path / "run", frames=1)
+    loaded = load_policy(tmp_path / "run")
+    for asked, played in ((None, "planar"), ("bullet", "bullet"), ("planar", "planar")):
+        env = loaded.make_env(1, simulator=asked)
+        assert env.base_env.config.simulator == played
+        assert env.base_env.config.task.stream == "eval"
+        env.close()
+
+
+@pytest.mark.parametrize("name", ["cura-cvar", "cura-perceptual"])
+def test_methods_beyond_the_paper_play_without_what_they_were_trained_with(tmp_path: Path, name: str) -> None:
+    """Catches an evaluation that needs the true obstacles, or reads another risk than the policy was trained by."""
+    config = method(name).replace(run_dir=tmp_path / "run", perception="none", simulator="planar")
+    save_checkpoint({"networks": Networks(config)}, config, tmp_path / "run", frames=1)
+    loaded = load_policy(tmp_path / "run")
+    env = loaded.make_env(2)
+    try:
+        played = env.rollout(2, loaded.policy)
+    finally:
+        env.close()
+    assert not {"obstacle_code", "obstacles"} & set(played.keys())
+    outputs = loaded.collision_estimator(played.select("observation", "latent"))
+    atoms = outputs["collision_atoms"].clamp(0, 1).sort(-1, descending=True).values
+    # The largest quarter of 50 atoms: 12 and half of the next.
+    tail = (atoms[..., :12].sum(-1) + 0.5 * atoms[..., 12]) / 12.5
+    expected = tail if name == "cura-cvar" else outputs["collision_atoms"].mean(-1)
+    torch.testing.assert_close(outputs["risk"].squeeze(-1), expected)
+
+
+def _outputs(value: torch.Tensor | tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
+    return value if isinstance(value, tuple) else (value,)
+
+
+def test_a_method_without_shipped_weights_and_a_wrong_path_are_told_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a wrong name that reads as a damaged installation."""
+    monkeypatch.setattr(loaded_policy, "SHIPPED_FOLDER", tmp_path)
+    with pytest.raises(CheckpointError, match="no weights of method 'push' are shipped"):
+        load_policy("push")
+    with pytest.raises(CheckpointError, match="no checkpoint at nowhere; accepted: the path of a run or checkpoint"):
+        load_policy("nowhere")
+    with pytest.raises(CheckpointError, match="no checkpoint at"):
+        load_policy(tmp_path)
