@@ -92,7 +92,7 @@ class RenderConfig:
         known_formats = (*STILL_FORMATS, *ANIMATION_FORMATS)
         require(bool(self.formats), "formats", self.formats, f"one or more of {', '.join(known_formats)}")
         for name in self.formats:
-            require_known("format", name, known_formats)
+            require(name in known_formats, "format", name, ", ".join(known_formats))
 
     @property
     def drawn(self) -> tuple[FigureName, ...]:
