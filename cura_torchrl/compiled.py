@@ -1,8 +1,10 @@
-"""Loops compiled for the CPU by numba: how, and on how many threads."""
+"""Loops compiled for the CPU by numba, and tensor operations fused for a GPU by torch: how, and on how many threads."""
 
 from __future__ import annotations
 
+import functools
 from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -35,6 +37,30 @@ def compiled(function: _Function) -> _Function:
     """
     precise = {"nnan", "ninf", "nsz", "contract"}
     return numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=precise)(function)  # type: ignore[return-value]
+
+
+def fused(function: _Function) -> _Function:
+    """Make few kernels of a function's tensor operations on a GPU: what is between them then stays in registers.
+
+    Compiled when first called there, and once more for any number of rows when a second one comes. Without Triton, and
+    on other devices, the operations run as they are written.
+
+    Args:
+        function: Function of tensors, of which the first tells the device, and constants.
+
+    Returns:
+        The function; compiled, its results differ by rounding.
+    """
+
+    @functools.cache
+    def kernels() -> Callable[..., Any]:
+        return torch.compile(function) if find_spec("triton") else function
+
+    @functools.wraps(function)
+    def run(first: torch.Tensor, *rest: Any) -> Any:
+        return (kernels() if first.is_cuda else function)(first, *rest)
+
+    return run  # type: ignore[return-value]
 
 
 def run_rows(kernel: Callable[..., None], batch: tuple[torch.Tensor, ...], *constants: Any) -> None:

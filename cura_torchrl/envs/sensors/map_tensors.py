@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from cura_torchrl.compiled import fused
 from cura_torchrl.envs.sensors import visibility, window
 
 if TYPE_CHECKING:
@@ -44,8 +45,21 @@ def mark_free(
         [1.0, 1.0, 0.0]
     """
     for rows in _chunks(stamps):
-        free = visibility.seen_free(*axes, scan[rows], sensor_pose[rows], margin)
-        stamps[rows] = torch.where(free, steps[rows, None, None], stamps[rows])
+        _mark_free(stamps[rows], steps[rows], *axes, scan[rows], sensor_pose[rows], margin)
+
+
+@fused
+def _mark_free(
+    stamps: torch.Tensor,
+    steps: torch.Tensor,
+    row_x: torch.Tensor,
+    column_y: torch.Tensor,
+    scan: torch.Tensor,
+    sensor_pose: torch.Tensor,
+    margin: float,
+) -> None:
+    free = visibility.seen_free(row_x, column_y, scan, sensor_pose, margin)
+    stamps.copy_(torch.where(free, steps[:, None, None], stamps))
 
 
 def mark_hits(
@@ -102,15 +116,27 @@ def fill_windows(
         tables: Occupancy per half of a stamp, 0 where none is shown, shape ``[W, W]``; confidence by age, shape
             ``[K]``, its last entry for all ages beyond.
     """
-    mask, powers = tables
     for rows in _chunks(windows[:, 0]):
-        stamp = window.sample_map(grid, stamps[rows], frames[0].points(rows))
-        last_seen = stamp.floor()
-        age = (steps[rows, None, None] - last_seen).clamp_max(len(powers) - 1)
-        windows[rows, 0] = powers[age.long()]
-        if windows.shape[1] > 1:
-            is_object = window.inside_footprint(frames[1].points(rows))
-            windows[rows, 1] = (stamp - last_seen) * mask * (1.0 - is_object)
+        on_map, on_object = (window.WindowFrame(frame.rows[:, rows], frame.columns[:, rows]) for frame in frames)
+        _fill_windows(windows[rows], grid.inside(stamps[rows]), steps[rows], on_map, on_object, *tables)
+
+
+@fused
+def _fill_windows(
+    windows: torch.Tensor,
+    maps: torch.Tensor,
+    steps: torch.Tensor,
+    on_map: WindowFrame,
+    on_object: WindowFrame,
+    mask: torch.Tensor,
+    powers: torch.Tensor,
+) -> None:
+    stamp = window.sample_map(maps, on_map.points())
+    last_seen = stamp.floor()
+    age = (steps[:, None, None] - last_seen).clamp_max(len(powers) - 1)
+    windows[:, 0] = powers[age.long()]
+    if windows.shape[1] > 1:
+        windows[:, 1] = (stamp - last_seen) * mask * (1.0 - window.inside_footprint(on_object.points()))
 
 
 def _chunks(maps: torch.Tensor) -> Iterator[slice]:

@@ -10,6 +10,8 @@ import math
 
 import torch
 
+from cura_torchrl.compiled import fused
+
 _GOLDEN = 0x9E3779B97F4A7C15 - 2**64  # odd; int64 arithmetic wraps
 _MULTIPLIERS = (0xBF58476D1CE4E5B9 - 2**64, 0x94D049BB133111EB - 2**64)
 
@@ -49,6 +51,7 @@ def noise_key(stream: int, seed: int, episodes: torch.Tensor) -> torch.Tensor:
     return key
 
 
+@fused
 def normal(key: torch.Tensor, count: torch.Tensor, size: int) -> torch.Tensor:
     """Return standard normal draws.
 

@@ -36,16 +36,9 @@ class WindowFrame(NamedTuple):
     columns: torch.Tensor
     """Terms of the columns, shape ``[2, N, 1, W]``."""
 
-    def points(self, rows: slice = slice(None)) -> torch.Tensor:
-        """Return the coordinates of the cells of some of the windows.
-
-        Args:
-            rows: Which of the windows.
-
-        Returns:
-            The two coordinates of each cell, shape ``[N, W, W, 2]``.
-        """
-        return (self.rows[:, rows] + self.columns[:, rows]).permute(1, 2, 3, 0)
+    def points(self) -> torch.Tensor:
+        """Return the two coordinates of each cell, shape ``[N, W, W, 2]``."""
+        return (self.rows + self.columns).permute(1, 2, 3, 0)
 
 
 def map_frame(grid: MapGrid, offsets: torch.Tensor, sensor_pose: torch.Tensor) -> WindowFrame:
@@ -109,12 +102,11 @@ def _frame(offsets: torch.Tensor, centre: torch.Tensor, ahead: torch.Tensor, lef
     return WindowFrame(rows[..., None].float(), (left[..., None] * offsets.double())[..., None, :].float())
 
 
-def sample_map(grid: MapGrid, maps: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+def sample_map(maps: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
     """Return what maps hold in the cells that points lie in.
 
     Args:
-        grid: The maps' cells.
-        maps: Stored maps, shape ``[N, num_rows, num_columns]``.
+        maps: The extent of stored maps, as from ``MapGrid.inside``, shape ``[N, num_x, num_y]``.
         points: Points as from :func:`map_frame` [1], shape ``[N, H, W, 2]``.
 
     Returns:
@@ -124,10 +116,10 @@ def sample_map(grid: MapGrid, maps: torch.Tensor, points: torch.Tensor) -> torch
         >>> from cura_torchrl.envs.sensors import MapGrid
         >>> grid = MapGrid(extent_x=(0.0, 0.2), extent_y=(0.0, 0.1), resolution=0.1)
         >>> maps = torch.arange(64.0).view(1, 4, 16)
-        >>> sample_map(grid, maps, torch.tensor([[[[0.0, -0.5], [0.0, 0.5], [0.0, 1.5]]]])).tolist()
+        >>> sample_map(grid.inside(maps), torch.tensor([[[[0.0, -0.5], [0.0, 0.5], [0.0, 1.5]]]])).tolist()
         [[[16.0, 32.0, 0.0]]]
     """
-    return F.grid_sample(grid.inside(maps)[:, None], points, mode="nearest", align_corners=False)[:, 0]
+    return F.grid_sample(maps[:, None], points, mode="nearest", align_corners=False)[:, 0]
 
 
 def inside_footprint(points: torch.Tensor) -> torch.Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from cura_torchrl.compiled import Floats, compiled, run_rows
+from cura_torchrl.compiled import Floats, compiled, fused, run_rows
 
 _CHUNK = 2**25
 """Ray-square pairs handled together where the loops are not compiled: bounds the work space."""
@@ -84,6 +84,7 @@ def _cut(
         share[r] = min(share[r], near) if is_hit else share[r]
 
 
+@fused
 def _nearest(parts: torch.Tensor, ray_x: torch.Tensor, ray_y: torch.Tensor) -> torch.Tensor:
     cos, sin, start_x, start_y, half = parts[..., None]
     ray_x, ray_y = ray_x[:, None], ray_y[:, None]

@@ -35,7 +35,7 @@ GRID = MapGrid(extent_x=(-2.0, 2.0), extent_y=(-1.5, 1.5), resolution=0.1)
 def window_cells(offsets: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
     """Return which cell of GRID each window cell shows, by its index in the flattened map; 0 outside of the extent."""
     indices = torch.arange(float(GRID.num_rows * GRID.num_columns)).view(1, GRID.num_rows, GRID.num_columns)
-    return sample_map(GRID, indices, map_frame(GRID, offsets, pose).points()).long()
+    return sample_map(GRID.inside(indices), map_frame(GRID, offsets, pose).points()).long()
 
 
 def place(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> torch.Tensor:
