@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
 from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.trainers import raster
-from cura_torchrl.trainers.raster import SCALE, Axis, Panel, font, rectangle_corners
+from cura_torchrl.trainers.raster import SCALE, SCENE_X, SCENE_Y, Axis, Panel, font, rectangle_corners
 from cura_torchrl.trainers.recording import Recording
 
 if TYPE_CHECKING:
@@ -27,8 +27,6 @@ FLASH_TIME = 1.5
 """Time for which an obstacle that has just appeared is marked [s]."""
 _PATH_WIDTH, _HIT_RADIUS = 0.09, 0.045
 """How wide paths are drawn, and how large the ends of rays [m]."""
-SCENE_X = Axis(-2.5, 16.0, (0, 2, 4, 6, 8, 10, 12, 14), "x [m]")
-SCENE_Y = Axis(-4.625, 4.625, (-4, -2, 0, 2, 4), "y [m]")
 _OUTCOME_COLOUR = {"success": raster.ROBOT, "collision": raster.FAILURE, "time-out": "#8a6100"}
 
 

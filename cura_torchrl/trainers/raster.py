@@ -57,6 +57,11 @@ class Axis:
     """Quantity and unit; empty leaves label and numbers out."""
 
 
+SCENE_X = Axis(-2.5, 16.0, (0, 2, 4, 6, 8, 10, 12, 14), "x [m]")
+SCENE_Y = Axis(-4.625, 4.625, (-4, -2, 0, 2, 4), "y [m]")
+"""What a picture of a scene shows, seen from above."""
+
+
 class Panel:
     """A plot area that maps values to pixels and clips what is drawn in it.
 

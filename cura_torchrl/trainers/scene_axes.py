@@ -18,7 +18,7 @@ from cura_torchrl.envs import geometry
 from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
 from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.trainers import raster
-from cura_torchrl.trainers.raster import rectangle_corners
+from cura_torchrl.trainers.raster import SCENE_X, SCENE_Y, rectangle_corners
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from cura_torchrl.trainers.recording import Recording
     from cura_torchrl.trainers.render_config import StillFormat
 
-_WORLD_X, _WORLD_Y = (-2.5, 16.0), (-4.625, 4.625)
+_MARGIN = 0.25
+"""Left between what is drawn and the frame, where that is beyond the usual limits [m]."""
 _MAP_TICKS = (-4, -2, 0, 2, 4)
 _DOTS = 140
 """Resolution of the pictures [pixel/inch]."""
@@ -215,12 +216,15 @@ def write(axis: Any, text: str, place: Any, *, up: float = 2.0, **options: Any) 
 
 
 def frame_world(axis: Any) -> None:
-    """Show the whole scene to scale.
+    """Show the whole scene to scale, and what went beyond.
 
     Args:
-        axis: Where to draw.
+        axis: Where all has been drawn.
     """
-    axis.set(xlim=_WORLD_X, ylim=_WORLD_Y, aspect="equal", xlabel="x [m]")
+    drawn = [sibling.dataLim for sibling in axis.get_shared_y_axes().get_siblings(axis)]
+    low, high = np.min([box.p0 for box in drawn], 0) - _MARGIN, np.max([box.p1 for box in drawn], 0) + _MARGIN
+    x, y = zip(np.minimum(low, (SCENE_X.low, SCENE_Y.low)), np.maximum(high, (SCENE_X.high, SCENE_Y.high)), strict=True)
+    axis.set(xlim=x, ylim=y, aspect="equal", xlabel="x [m]")
     axis.set_xticks(range(-2, 17, 2))
     tidy(axis)
 

@@ -13,14 +13,12 @@ from cura_torchrl.envs.simulation.camera import Camera, View
 from cura_torchrl.trainers import raster
 from cura_torchrl.trainers.animation import (
     FLASH_TIME,
-    SCENE_X,
-    SCENE_Y,
     draw_floor,
     draw_legend,
     draw_status,
     frame_numbers,
 )
-from cura_torchrl.trainers.raster import SCALE, Panel, font
+from cura_torchrl.trainers.raster import SCALE, SCENE_X, SCENE_Y, Panel, font
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 
 import numpy as np
+from matplotlib.figure import Figure
 from PIL import Image, ImageColor
 
 from cura_torchrl.envs.config import ScenarioConfig
 from cura_torchrl.trainers import figures, raster
 from cura_torchrl.trainers.estimate_figures import distribution_figure
+from cura_torchrl.trainers.scene_axes import draw_paths
 from tests.recordings import make_recording
 
 
@@ -35,6 +38,19 @@ def test_paths_show_robot_object_and_obstacle_for_each_recording() -> None:
     left, right = np.array_split(picture, 2, axis=1)
     assert count(left, raster.FAILURE) == 0
     assert count(right, raster.FAILURE) > 10
+
+
+def test_a_path_that_leaves_the_scene_is_shown() -> None:
+    """Catches paths that are cut off, and neighbours to another scale."""
+    near, far = make_recording(), make_recording()
+    far = dataclasses.replace(far, object_pose=far.object_pose + np.array([0.0, 6.0, 0.0]))
+    left, right = Figure().subplots(1, 2, sharey=True)
+    draw_paths(left, far)
+    assert left.get_xlim() == (raster.SCENE_X.low, raster.SCENE_X.high)
+    draw_paths(right, near)
+    low, high = right.get_ylim()
+    assert low == raster.SCENE_Y.low
+    assert far.object_pose[:, 1].max() < high < 8.0
 
 
 def test_snapshots_and_distributions_are_pictures() -> None:
