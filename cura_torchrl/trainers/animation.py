@@ -345,8 +345,8 @@ def _draw_atoms(column: _Column, index: int) -> Image.Image:
 def _draw_numbers(frame: Image.Image, column: _Column, index: int) -> None:
     step, draw = _step(column, index), ImageDraw.Draw(frame)
     for panel, text, colour in (
-        (column.risk, raster.two_digits(column.recording.risk[step]), raster.RISK),
-        (column.uncertainty, f"{column.recording.uncertainty[step]:.3f}", raster.UNCERTAINTY),
+        (column.risk, raster.three_digits(column.recording.risk[step]), raster.RISK),
+        (column.uncertainty, raster.three_digits(column.recording.uncertainty[step]), raster.UNCERTAINTY),
     ):
         place = (panel.left + panel.width) * SCALE, (panel.top - 4) * SCALE
         draw.text(place, text, fill=colour, font=font(11, bold=True), anchor="rs")

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch, Polygon
 
 from cura_torchrl.trainers import raster
 from cura_torchrl.trainers.moments import Appearance, find_appearance, frames_at
-from cura_torchrl.trainers.raster import rectangle_corners, two_digits
+from cura_torchrl.trainers.raster import rectangle_corners, three_digits
 from cura_torchrl.trainers.scene_axes import draw_map, draw_scan, encode, outline, place_in_base, set_margins, tidy
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def distribution_figure(
     """
     count, rows = len(times) or 3, len(recordings)
     figure = Figure(figsize=(3.0 * count + 4.2, 0.8 + 2.3 * rows))
-    grid = figure.add_gridspec(rows, count + 1, width_ratios=[1.0] * count + [1.5], wspace=0.24, hspace=0.34)
+    grid = figure.add_gridspec(rows, count + 1, width_ratios=[1.0] * count + [1.5], wspace=0.28, hspace=0.34)
     shared = None
     for row, recording in enumerate(recordings):
         frames = frames_at(recording, times)
@@ -67,7 +67,7 @@ def _draw_atoms(axis: Any, recording: Recording, step: int, name: str) -> None:
     risk, uncertainty = recording.risk[step], recording.uncertainty[step]
     axis.hist(atoms, np.linspace(0.0, 1.0, 26), weights=np.full(atoms.size, 1.0 / atoms.size), color=raster.UNCERTAINTY)
     axis.axvline(risk, color=raster.RISK, linewidth=1.8)
-    title = f"{name}: t = {recording.times[step]:.1f} s, R = {two_digits(risk)}, U = {uncertainty:.3f}"
+    title = f"{name}: t = {recording.times[step]:.1f} s, R = {three_digits(risk)}, U = {three_digits(uncertainty)}"
     axis.set_title(title, fontsize=9, loc="left")
     axis.set_xlim(0.0, 1.0)
     tidy(axis)
@@ -88,7 +88,7 @@ def _draw_curves(axes: Sequence[Any], recordings: Sequence[Recording], row: int,
         for mark in marks:
             axis.axvline(mark, color=raster.FAINT, linewidth=0.8, linestyle=":")
         axis.set_ylabel(label)
-        axis.yaxis.set_label_coords(-0.135, 0.5)
+        axis.yaxis.set_label_coords(-0.16, 0.5)
         axis.set_xlim(0.0, end)
         tidy(axis)
     axes[0].tick_params(labelbottom=False)

@@ -215,20 +215,20 @@ def rectangle_corners(pose: Sequence[float] | NDArray[np.floating], length: floa
     return local @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(pose[:2], dtype=np.float64)
 
 
-def two_digits(value: float) -> str:
+def three_digits(value: float) -> str:
     """Return a number as it is written into pictures; the estimator's atoms are not bounded by zero.
 
     Args:
         value: The number.
 
     Returns:
-        Two digits after the point, and no sign where they are zero.
+        Three digits after the point, and no sign where they are zero.
 
     Examples:
-        >>> two_digits(-0.004), two_digits(0.126)
-        ('0.00', '0.13')
+        >>> three_digits(-0.0004), three_digits(0.1256)
+        ('0.000', '0.126')
     """
-    return f"{round(float(value), 2) + 0.0:.2f}"
+    return f"{round(float(value), 3) + 0.0:.3f}"
 
 
 def finish(frame: Image.Image) -> Image.Image:

@@ -149,9 +149,8 @@ def _frame(recordings: Sequence[Recording], cameras: Sequence[Camera], number: i
         step = int(recording.frame_steps[min(number, len(recording.frame_steps) - 1)])
         left, draw = (column * width + 10) * SCALE, ImageDraw.Draw(whole)
         draw.text((left, 19 * SCALE), recording.label, fill=raster.INK, font=font(12, bold=True), anchor="ls")
-        estimate = (
-            f"risk R = {raster.two_digits(recording.risk[step])}, uncertainty U = {recording.uncertainty[step]:.3f}"
-        )
+        risk, uncertainty = (raster.three_digits(series[step]) for series in (recording.risk, recording.uncertainty))
+        estimate = f"risk R = {risk}, uncertainty U = {uncertainty}"
         draw.text((left, 37 * SCALE), estimate, fill=raster.INK, font=font(11), anchor="ls")
         draw_status(whole, recording, step, ((column + 1) * width - 10, 19))
     draw_legend(whole, HEADER + height + FOOTER - 12)
