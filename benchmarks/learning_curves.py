@@ -1,6 +1,7 @@
 """Draw the curves of runs side by side; a run is a method whose weights are shipped, a folder, or its progress.csv.
 
-python benchmarks/learning_curves.py cura-ppo push --output docs/_static/learning_curves.png
+python benchmarks/learning_curves.py cura-ppo push --output curves.png
+python benchmarks/learning_curves.py runs/cura-ppo-0,runs/cura-ppo-1 runs/push-0,runs/push-1 --output curves.png
 """
 
 from __future__ import annotations
@@ -67,18 +68,24 @@ def last_means(rows: list[dict[str, float]]) -> dict[str, float]:
 def main() -> None:
     """Parse the command line and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", help="methods whose weights are shipped, or folders of runs")
+    parser.add_argument(
+        "runs", nargs="+", help="methods whose weights are shipped, or folders of runs; commas join the seeds of one"
+    )
     parser.add_argument("--output", type=Path, required=True, help="picture to write")
     parser.add_argument("--summary", type=Path, help="JSON file to write, with means over the last updates of each run")
     options = parser.parse_args()
     figure = Figure(figsize=(11, 5.6), layout="constrained")
     axes = figure.subplots(2, 3, sharex=True)
     summary = {}
-    for run in options.runs:
-        rows = rows_of(run)
-        summary[Path(run).stem] = last_means(rows)
-        for axis, (name, _) in zip(axes.flat, PANELS, strict=True):
-            axis.plot(*smooth(rows, name), label=Path(run).stem, linewidth=1.4)
+    for index, group in enumerate(options.runs):
+        seeds = group.split(",")
+        name = Path(group).stem if len(seeds) == 1 else Path(seeds[0]).stem.rpartition("-")[0]
+        for run in seeds:
+            rows = rows_of(run)
+            summary[Path(run).stem] = last_means(rows)
+            look = {"color": f"C{index}", "linewidth": 1.4 if len(seeds) == 1 else 0.9}
+            for axis, (column, _) in zip(axes.flat, PANELS, strict=True):
+                axis.plot(*smooth(rows, column), label=name if run == seeds[0] else None, **look)
     for axis, (name, title) in zip(axes.flat, PANELS, strict=True):
         axis.set_title(title, loc="left", fontsize=9)
         axis.grid(alpha=0.3)
