@@ -22,6 +22,7 @@ from cura_torchrl.objectives.functional import (
     standardise,
     uncertainty_cost,
 )
+from cura_torchrl.objectives.seeded import SeededModule
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
@@ -47,7 +48,7 @@ class _Costs(NamedTuple):
     uncertainty_mask: torch.Tensor
 
 
-class CURAAdvantage(TensorDictModuleBase):
+class CURAAdvantage(SeededModule, TensorDictModuleBase):
     """Advantage A - lambda_r C^R - lambda_u C^U with normalised costs, and SR(lambda) targets of the estimator.
 
     Apply it once per rollout, before the first gradient step: the costs and targets are those of the old estimator.
@@ -173,7 +174,7 @@ class CURAAdvantage(TensorDictModuleBase):
         self.tensor_keys = self._AcceptedKeys()
         self.register_buffer("risk_coeff", torch.tensor(float(risk_coeff)))
         self.register_buffer("uncertainty_coeff", torch.tensor(float(uncertainty_coeff)))
-        self._generator = torch.Generator().manual_seed(seed)
+        self.seed(seed)
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Copy numbers assigned to a coefficient into its buffer; set all else as usual."""
@@ -182,18 +183,6 @@ class CURAAdvantage(TensorDictModuleBase):
             buffer.fill_(value)
         else:
             super().__setattr__(name, value)
-
-    def get_extra_state(self) -> torch.Tensor:
-        """Return the generator's state, saved so that a resumed run equals an unbroken one."""
-        return self._generator.get_state()
-
-    def set_extra_state(self, state: torch.Tensor) -> None:
-        """Restore the generator's state.
-
-        Args:
-            state: What :meth:`get_extra_state` returned.
-        """
-        self._generator.set_state(state.cpu())
 
     def set_keys(self, **kwargs: NestedKey) -> None:
         """Change the keys that are read and written.
@@ -254,7 +243,7 @@ class CURAAdvantage(TensorDictModuleBase):
             self._cut(tensordict),
             gamma=self.collision_gamma,
             lmbda=self.collision_lmbda,
-            generator=self._generator,
+            generator=self.generator,
         )
         tensordict.set(names.collision_target, targets)
         raw, costs = tensordict.get(names.advantage), self._costs(tensordict)
@@ -346,7 +335,7 @@ class CURAAdvantage(TensorDictModuleBase):
 
     def _shuffle(self, values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         inside = values[mask]
-        order = torch.randperm(len(inside), generator=self._generator)
+        order = torch.randperm(len(inside), generator=self.generator)
         return values.masked_scatter(mask, inside[order.to(inside.device)])
 
     def _scale(self, advantage: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:

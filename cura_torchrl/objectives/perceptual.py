@@ -6,18 +6,18 @@ from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDict
-from torch import nn
 
 from cura_torchrl import keys
 from cura_torchrl.objectives.energy import energy_distance
 from cura_torchrl.objectives.functional import sr_lambda_targets
+from cura_torchrl.objectives.seeded import SeededModule
 
 if TYPE_CHECKING:
     from tensordict import NestedKey, TensorDictBase
     from tensordict.nn import TensorDictModule
 
 
-class PerceptualObjective(nn.Module):
+class PerceptualObjective(SeededModule):
     """Targets and losses of two estimators, of which the second predicts Var(E[C | s] | o) from the observation alone.
 
     With o part of the state s, the law of total variance splits the paper's uncertainty:
@@ -86,19 +86,7 @@ class PerceptualObjective(nn.Module):
         self.perceptual_network = perceptual_network
         self.gamma = gamma
         self.lmbda = lmbda
-        self._generator = torch.Generator().manual_seed(seed)
-
-    def get_extra_state(self) -> torch.Tensor:
-        """Return the generator's state, saved so that a resumed run equals an unbroken one."""
-        return self._generator.get_state()
-
-    def set_extra_state(self, state: torch.Tensor) -> None:
-        """Restore the generator's state.
-
-        Args:
-            state: What :meth:`get_extra_state` returned.
-        """
-        self._generator.set_state(state.cpu())
+        self.seed(seed)
 
     @property
     def rollout_keys(self) -> list[NestedKey]:
@@ -131,7 +119,7 @@ class PerceptualObjective(nn.Module):
             tensordict.get(("next", "done")),
             gamma=self.gamma,
             lmbda=self.lmbda,
-            generator=self._generator,
+            generator=self.generator,
         )
         tensordict.set(keys.PRIVILEGED_TARGET, targets)
         # C is a discounted indicator: an expectation outside of [0, 1] is the linear head's error.
