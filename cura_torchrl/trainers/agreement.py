@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from cura_torchrl.trainers.evaluate import outcome_letter
-from cura_torchrl.trainers.statistics import paired_difference
+from cura_torchrl.trainers.statistics import bootstrap_interval
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -27,7 +29,7 @@ class Agreement:
     success: float
     """Success in this set [1]."""
     low: float
-    """Lower bound of the 95 % interval of the difference of the successes, Newcombe's for pairs [1]."""
+    """Lower bound of the 95 % bootstrap interval of the difference of the successes, over scenes [1]."""
     high: float
     """Upper bound of it [1]."""
 
@@ -36,7 +38,8 @@ def agreement(pairs: Iterable[tuple[Episode, Episode]]) -> Agreement | None:
     """Return how episodes of the same scenes compare.
 
     Args:
-        pairs: For each scene, how it was played in the other set and in this one.
+        pairs: How scenes were played in the other set and in this one. Those of one index are drawn together for the
+            interval, for a scene is alike in all cells, and all policies play it.
 
     Returns:
         The numbers; None where there are no pairs.
@@ -45,7 +48,9 @@ def agreement(pairs: Iterable[tuple[Episode, Episode]]) -> Agreement | None:
     if not both:
         return None
     others, own = ([episode.success[0] for episode in side] for side in zip(*both, strict=True))
-    _, low, high = paired_difference(others, own)
+    scenes, of = np.unique([mine.index for _, mine in both], return_inverse=True)
+    gained, played = np.bincount(of, np.subtract(own, others, dtype=float)), np.bincount(of)
+    low, high = bootstrap_interval(lambda pick: float(gained[pick].sum() / played[pick].sum()), len(scenes))
     return Agreement(
         scenes=len(both),
         alike=sum(outcome_letter(other) == outcome_letter(mine) for other, mine in both) / len(both),

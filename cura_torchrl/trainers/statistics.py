@@ -140,8 +140,9 @@ def bootstrap_rates(
 ) -> list[NDArray[np.float64]]:
     """Return success rates of scenes and training seeds that are drawn anew, with replacement.
 
-    Scenes are drawn in each cell apart (stratified), the same for all methods, which are thereby paired. Seeds are
-    drawn for each method apart, the same for all cells, for one policy plays them all; with one seed only scenes vary.
+    Scenes are drawn once for all cells and methods: the methods are paired, and scene i has the same goal, friction and
+    times in every cell, so that cells are no independent samples. Seeds are drawn for each method apart, the same for
+    all cells, for one policy plays them all; with one seed only scenes vary.
 
     Args:
         cells: For each cell, for each method, whether each trial succeeded, shape ``[S, M]``: S seeds, M scenes.
@@ -151,6 +152,9 @@ def bootstrap_rates(
     Returns:
         For each method the rates [1], shape ``[B, S, C]``: C cells.
 
+    Raises:
+        ValueError: If cells differ in their number of scenes.
+
     Examples:
         >>> [rates.shape for rates in bootstrap_rates([[[[1, 0, 1]], [[1, 1, 1]]]], samples=5)]
         [(5, 1, 1), (5, 1, 1)]
@@ -158,13 +162,16 @@ def bootstrap_rates(
     rng = np.random.default_rng(seed)
     trials = [[np.atleast_2d(np.asarray(entry, dtype=np.float64)) for entry in cell] for cell in cells]
     drawn = [rng.integers(0, len(entry), (samples, len(entry))) for entry in trials[0]]
-    rates: list[list[NDArray[np.float64]]] = [[] for _ in drawn]
-    for cell in trials:
-        count = cell[0].shape[1]
-        weights = rng.multinomial(count, np.full(count, 1.0 / count), samples) / count
-        for found, seeds, entry in zip(rates, drawn, cell, strict=True):
-            found.append(np.take_along_axis(weights @ entry.T, seeds, 1))
-    return [np.stack(found, axis=-1) for found in rates]
+    count, *others = {entry.shape[1] for cell in trials for entry in cell}
+    if others:
+        msg = f"cells hold {sorted([count, *others])} scenes; accepted: the same scenes in all"
+        raise ValueError(msg)
+    weights = rng.multinomial(count, np.full(count, 1.0 / count), samples) / count
+    methods = zip(*trials, strict=True)
+    return [
+        np.stack([np.take_along_axis(weights @ entry.T, seeds, 1) for entry in method], axis=-1)
+        for seeds, method in zip(drawn, methods, strict=True)
+    ]
 
 
 def share_recovered(cells: Sequence[Sequence[ArrayLike]], confidence: float = 0.95) -> tuple[float, float, float]:

@@ -193,7 +193,13 @@ def _agreement(config: TableConfig, store: OutcomeStore, policies: list[PolicyRe
                 compared = agreement(both)
                 if compared is not None:
                     found[method, simulator] = compared
-        return agreement_section(found, f"{path.as_posix()} (chunk {other.chunk}, here {store.chunk})")
+        there = {(entry.method, entry.training_seed): entry.weights_sha256 for entry in other.policies()}
+        changed = [
+            f"{entry.method} {'' if entry.training_seed == SHIPPED else entry.training_seed}".rstrip()
+            for entry in policies
+            if there.get((entry.method, entry.training_seed), entry.weights_sha256) != entry.weights_sha256
+        ]
+        return agreement_section(found, f"{path.as_posix()} (chunk {other.chunk}, here {store.chunk})", changed)
 
 
 def _description(config: TableConfig) -> str:

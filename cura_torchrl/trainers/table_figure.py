@@ -98,7 +98,7 @@ def _add_legend(figure: Figure, methods: list[str], results: list[Result], title
     ]
     if any(not math.isnan(r.paper) for r in results):
         handles.append(Line2D([], [], linestyle="none", label="the paper", **_MARK))
-    interval = "Wilson's 95 % interval" if results[0].seeds == 1 else "95 % bootstrap interval of the IQM over seeds"
+    interval = "95 % interval over scenes" if results[0].seeds == 1 else "95 % bootstrap interval of the IQM over seeds"
     handles.append(Line2D([], [], color=raster.INK, linestyle="none", marker="|", markersize=11, label=interval))
     height = float(figure.get_size_inches()[1])
     columns = min(len(handles), 4 if len(methods) > _FEW else 3)

@@ -53,7 +53,8 @@ class Result:
     success: float
     """Goal reached within 0.5 m before any collision [1]."""
     low: float
-    """Lower bound of the 95 % interval [1]: Wilson's of the success; with several seeds, the IQM's by bootstrap."""
+    """Lower bound of the 95 % interval [1]: Wilson's of the success; over all cells by bootstrap, with several seeds of
+    the IQM."""
     high: float
     """Upper bound of it [1]."""
     iqm: float
@@ -95,11 +96,11 @@ class Result:
     difference: float
     """Success less that of the baseline, on the same scenes [1]."""
     difference_low: float
-    """Lower bound of its 95 % interval [1]: Newcombe's; with several seeds, by bootstrap."""
+    """Lower bound of its 95 % interval [1]: Newcombe's; over all cells and with several seeds, by bootstrap."""
     difference_high: float
     """Upper bound of it [1]."""
     mcnemar_p: float
-    """McNemar's exact p of the difference [1]; with several seeds NaN, for their pairs are not independent."""
+    """McNemar's exact p of the difference [1]; NaN over all cells and with several seeds, whose pairs share scenes."""
     share: float
     """Share of the loss by occlusion that is recovered [1]."""
     share_low: float
@@ -184,12 +185,13 @@ def _trials(runs: Sequence[Sequence[Episode]]) -> NDArray[np.bool_]:
 
 def _interval(trials: list[NDArray[np.bool_]]) -> tuple[float, float, float]:
     """Return the interquartile mean, NaN with one seed, and the interval of the success."""
-    if len(trials[0]) == 1:
-        joined = np.concatenate(trials, axis=1)
-        return math.nan, *wilson_interval(int(joined.sum()), joined.size)
+    has_seeds = len(trials[0]) > 1
+    if len(trials) == 1 and not has_seeds:
+        return math.nan, *wilson_interval(int(trials[0].sum()), trials[0].size)
     (drawn,) = bootstrap_rates([[cell] for cell in trials])
-    low, high = np.quantile(interquartile_mean(drawn.reshape(len(drawn), -1)), (0.025, 0.975))
-    middle = interquartile_mean(np.concatenate([cell.mean(axis=1) for cell in trials]))
+    rates = drawn.reshape(len(drawn), -1)
+    low, high = np.quantile(interquartile_mean(rates) if has_seeds else rates.mean(-1), (0.025, 0.975))
+    middle = interquartile_mean(np.concatenate([cell.mean(axis=1) for cell in trials])) if has_seeds else math.nan
     return float(middle), float(low), float(high)
 
 
@@ -198,8 +200,8 @@ def _difference(played: Played, method: str, group: list[str]) -> tuple[tuple[fl
     if method == BASELINE or BASELINE not in played:
         return _NAN, math.nan
     pairs = [[_trials(played[who][cell]) for who in (BASELINE, method)] for cell in group]
-    if len(pairs[0][0]) == 1:
-        one, other = (np.concatenate([pair[k] for pair in pairs], axis=1) for k in range(2))
+    if len(pairs) == 1 and len(pairs[0][0]) == 1:
+        one, other = pairs[0]
         return paired_difference(one, other), mcnemar(one, other)
     one, other = (rates.mean((1, 2)) for rates in bootstrap_rates(pairs))
     low, high = np.quantile(other - one, (0.025, 0.975))

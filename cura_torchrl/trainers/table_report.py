@@ -66,12 +66,13 @@ def _note(results: list[Result]) -> str:
     start = "In each cell: success in per cent within 0.5 m of the goal before any collision,"
     if results[0].seeds == 1:
         return (
-            f"{start} and Wilson's 95 % interval. The interval is over scenes only: there is one policy of each method,"
-            " and how much training seeds differ is not in it."
+            f"{start} and Wilson's 95 % interval, over all cells a bootstrap one, for scenes are alike in all cells."
+            " The interval is over scenes only: there is one policy of each method, and how much training seeds differ"
+            " is not in it."
         )
     return (
         f"{start} as the mean over {results[0].seeds} training seeds; then the interquartile mean (IQM) with its 95 %"
-        " bootstrap interval over seeds and scenes, stratified by cell."
+        " bootstrap interval over seeds and scenes."
     )
 
 
@@ -113,7 +114,10 @@ def _differences(results: list[Result]) -> list[str]:
         for r in results
         if not math.isnan(r.difference)
     ]
-    how = "Newcombe's 95 % interval for pairs, and McNemar's exact p"
+    how = (
+        "Newcombe's 95 % interval for pairs, and McNemar's exact p; over all cells a bootstrap interval over scenes, and"
+        " no p, for cells share scenes"
+    )
     if results[0].seeds > 1:
         how = "its 95 % bootstrap interval over seeds and scenes; seeds share scenes, so that there is no p"
     section = [
@@ -170,12 +174,13 @@ def _ways(results: list[Result]) -> list[str]:
     return section if rows else []
 
 
-def agreement_section(found: Mapping[tuple[str, str], Agreement], title: str) -> str:
+def agreement_section(found: Mapping[tuple[str, str], Agreement], title: str, changed: Sequence[str] = ()) -> str:
     """Return how the outcomes compare with those of another file in Markdown.
 
     Args:
         found: The comparison by name of the method, or "all", and by name of the other simulator.
         title: What they are compared with, in words.
+        changed: Names of the policies that have other weights there.
 
     Returns:
         A section of the page.
@@ -201,7 +206,11 @@ def agreement_section(found: Mapping[tuple[str, str], Agreement], title: str) ->
         "here [%]",
         "Difference [points]",
     )
-    told = "Success, collision or time-out on the same scenes; the difference with Newcombe's 95 % interval for pairs."
+    told = (
+        "Success, collision or time-out on the same scenes; the difference with a 95 % bootstrap interval over scenes."
+    )
+    if changed:
+        told += f" The other file is of **other weights** of {', '.join(changed)}."
     return (
         "\n\n".join([f"## Agreement with {title}", told, _rows(head, rows) if rows else "No scene is in both."]) + "\n"
     )

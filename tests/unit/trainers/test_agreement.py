@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from cura_torchrl.trainers.agreement import agreement, pair
 from tests.episodes import run_of
 
@@ -29,5 +27,14 @@ def test_the_same_outcomes_agree_wholly() -> None:
     found = agreement(pair(run_of("scts"), run_of("scts")))
     assert found is not None
     assert found.alike == 1.0
-    assert found.low <= 0.0 <= found.high
-    assert found.low == pytest.approx(-found.high)
+    assert found.low == found.high == 0.0
+
+
+def test_a_scene_that_many_policies_play_counts_once() -> None:
+    """Catches an interval that takes the policies on a scene for independent: ten times the pairs say no more."""
+    once = pair(run_of("st" * 10), run_of("ss" * 10))
+    one, ten = agreement(once), agreement(once * 10)
+    assert one is not None
+    assert ten is not None
+    assert (ten.low, ten.high) == (one.low, one.high)
+    assert one.high - one.low > 0.3  # 20 scenes in half of which the difference is 1: 4 sqrt(0.25 / 20) = 0.45

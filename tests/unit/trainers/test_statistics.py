@@ -82,6 +82,10 @@ def test_drawn_scenes_are_the_same_for_all_methods_and_drawn_seeds_are_not() -> 
     assert np.allclose(first + opposite, 1.0)
     # A rate of 1/2 in 40 scenes: standard deviation sqrt(0.25 / 40) = 0.079
     assert first.std() == pytest.approx(0.079, abs=0.015)
+    both = bootstrap_rates([[[one]], [[one]]], samples=200)[0].mean((1, 2))
+    assert both.std() == pytest.approx(0.079, abs=0.015)  # the same scenes in a second cell tell nothing new
+    with pytest.raises(ValueError, match=r"cells hold \[2, 3\] scenes; accepted: the same scenes in all"):
+        bootstrap_rates([[[[0, 1]]], [[[0, 1, 1]]]])
     seeds = np.array([[1] * 9, [0] * 9])
     left, right = bootstrap_rates([[seeds, seeds], [seeds, seeds]], samples=200)
     assert np.allclose(left[:, :, 0], left[:, :, 1])  # one policy plays all cells
