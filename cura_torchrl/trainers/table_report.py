@@ -115,8 +115,8 @@ def _differences(results: list[Result]) -> list[str]:
         if not math.isnan(r.difference)
     ]
     how = (
-        "Newcombe's 95 % interval for pairs, and McNemar's exact p; over all cells a bootstrap interval over scenes, and"
-        " no p, for cells share scenes"
+        "Newcombe's 95 % interval for pairs, and McNemar's exact p; over all cells a bootstrap interval over scenes,"
+        " and no p, for cells share scenes"
     )
     if results[0].seeds > 1:
         how = "its 95 % bootstrap interval over seeds and scenes; seeds share scenes, so that there is no p"
