@@ -61,9 +61,9 @@ class ConfidenceMap(Transform):
 
     A reset forgets the rows that are reset and integrates their first scan; in the other rows the window that
     ``_reset`` returns is 0, for TorchRL keeps their old value. Rows never depend on one another. A range that is not a
-    number has seen nothing; a pose that is not finite raises ``RuntimeError``. Called as a module, outside of an
-    environment, the transform integrates one more scan; it is no transform for a replay buffer, whose samples are in no
-    order. The time of a step grows with the cells of the extent.
+    number has seen nothing; a pose that is not finite, or an object's size that is not finite and positive, raises
+    ``RuntimeError``. Called as a module, outside of an environment, the transform integrates one more scan; it is no
+    transform for a replay buffer, whose samples are in no order. The time of a step grows with the cells of the extent.
 
     Args:
         config: Decay, extent, window and channels.
@@ -171,7 +171,7 @@ class ConfidenceMap(Transform):
             scan: Ranges [m], shape ``[N, R]``.
             sensor_pose: Sensor (x [m], y [m], yaw [rad]), world frame, finite, shape ``[N, 3]``.
             object_pose: Object's centre (x [m], y [m], yaw [rad]), world frame, finite, shape ``[N, 3]``.
-            object_size: Object's footprint (length, width) [m], shape ``[N, 2]``.
+            object_size: Object's footprint (length, width) [m], finite and positive, shape ``[N, 2]``.
 
         Returns:
             The maps and their time after the scan, and the windows, shape ``[N, C, W, W]``.
@@ -267,7 +267,10 @@ class ConfidenceMap(Transform):
         """Return the windows after one scan is integrated into ``stamps`` and ``steps``, in place."""
         steps += 1
         scan, pose = visibility.clean_scan(inputs[0], self.max_range), inputs[1].contiguous()
-        torch._assert_async(pose.isfinite().all(), "a sensor's pose is out of bounds: accepted are finite numbers")
+        _require_all(pose.isfinite(), "a sensor's pose is out of bounds: accepted are finite numbers")
+        _require_all(inputs[2].isfinite(), "an object's pose is out of bounds: accepted are finite numbers")
+        size = inputs[3]
+        _require_all(size.isfinite() & (size > 0.0), "an object's size is out of bounds: accepted are positive numbers")
         cells = map_kernels if scan.device.type == "cpu" else map_tensors
         return self._integrate(cells, stamps, steps, [scan, pose, *inputs[2:]])
 
@@ -308,6 +311,11 @@ class ConfidenceMap(Transform):
     def _write(self, tensordict: TensorDictBase, window: torch.Tensor) -> TensorDictBase:
         tensordict.set(self.out_keys[0], window.view(*self._batch_shape, *window.shape[1:]))
         return tensordict
+
+
+def _require_all(holds: torch.Tensor, message: str) -> None:
+    """Raise ``RuntimeError`` unless a condition holds everywhere: at once on the CPU, without waiting elsewhere."""
+    torch._assert_async(holds.all(), message)
 
 
 def _decay_powers(decay: float) -> torch.Tensor:

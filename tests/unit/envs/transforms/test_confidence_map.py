@@ -240,6 +240,27 @@ class TestScenes:
             with pytest.raises(RuntimeError, match="out of bounds"):
                 make_map(object_keys=None)(scan_of([]).set("sensor_pose", torch.full((1, 3), bad)))
 
+    @pytest.mark.parametrize(
+        ("key", "column", "value", "message"),
+        [
+            ("sensor_pose", 2, math.nan, "sensor's pose"),
+            ("object_pose", 0, math.nan, "object's pose"),
+            ("object_pose", 2, -math.inf, "object's pose"),
+            ("object_size", 1, math.nan, "object's size"),
+            ("object_size", 0, math.inf, "object's size"),
+            ("object_size", 0, 0.0, "object's size"),
+            ("object_size", 1, -0.5, "object's size"),
+        ],
+    )
+    def test_an_impossible_object_raises(self, key: str, column: int, value: float, message: str) -> None:
+        """Catches an object that is no rectangle and takes every obstacle out of the window without a word."""
+        data = scan_of([(1.5, 0.0, 0.0, 0.4, 0.4)])
+        data["object_pose"], data["object_size"] = torch.tensor([[-1.5, 0.0, 0.0]]), torch.full((1, 2), 0.5)
+        assert make_map()(data.clone())["confidence_map"][0, 1].any()
+        data[key][0, column] = value
+        with pytest.raises(RuntimeError, match=message):
+            make_map()(data)
+
     def test_an_object_seen_between_free_steps_is_an_obstacle_only_then(self) -> None:
         """Catches an order of stamps in which a later free observation does not outdo an earlier obstacle."""
         transform, wall = make_map(object_keys=None), scan_of([(1.5, 0.0, 0.0, 0.4, 0.4)])
