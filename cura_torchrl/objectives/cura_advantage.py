@@ -22,6 +22,7 @@ from cura_torchrl.objectives.functional import (
     standardise,
     uncertainty_cost,
 )
+from cura_torchrl.objectives.rollout import MASK, cut_at_padding, read_mask
 from cura_torchrl.objectives.seeded import SeededModule
 
 if TYPE_CHECKING:
@@ -52,10 +53,10 @@ class CURAAdvantage(SeededModule, TensorDictModuleBase):
     """Advantage A - lambda_r C^R - lambda_u C^U with normalised costs, and SR(lambda) targets of the estimator.
 
     Apply it once per rollout, before the first gradient step: the costs and targets are those of the old estimator.
-    With both coefficients at zero the advantage equals that of ``GAE(average_gae=True)`` to the last bit; set them to
-    zero until the estimator has been trained for a while. Like TorchRL's estimators it writes into its input. The
-    defaults are the letter of the paper; :class:`~cura_torchrl.trainers.config.CURAConfig` has those that train well on
-    the pushing task.
+    With both coefficients at zero, ``normalise_sum`` and no padding, the advantage equals that of
+    ``GAE(average_gae=True)`` to the last bit; set them to zero until the estimator has been trained for a while. Like
+    TorchRL's estimators it writes into its input. The defaults are the letter of the paper;
+    :class:`~cura_torchrl.trainers.config.CURAConfig` has those that train well on the pushing task.
 
     Reads and writes (default keys), time being the last batch dimension:
 
@@ -126,7 +127,7 @@ class CURAAdvantage(SeededModule, TensorDictModuleBase):
         risk: NestedKey = keys.RISK
         uncertainty: NestedKey = keys.UNCERTAINTY
         collision_target: NestedKey = keys.COLLISION_TARGET
-        mask: NestedKey = ("collector", "mask")
+        mask: NestedKey = MASK
 
     default_keys = _AcceptedKeys
     risk_coeff: torch.Tensor
@@ -230,7 +231,7 @@ class CURAAdvantage(SeededModule, TensorDictModuleBase):
             The same tensordict.
         """
         names = self.tensor_keys
-        self.value_estimator(tensordict)
+        self._estimate_advantage(tensordict)
         atoms = self._estimate(tensordict)
         next_atoms = self._estimate(tensordict.get("next"))
         cost = tensordict.get(_next(names.cost))
@@ -287,6 +288,19 @@ class CURAAdvantage(SeededModule, TensorDictModuleBase):
             "energy_distance": masked_moments(distance.unsqueeze(-1), mask)[0],
         }
 
+    def _estimate_advantage(self, tensordict: TensorDictBase) -> None:
+        names = self.tensor_keys
+        if self._mask(tensordict) is None:
+            self.value_estimator(tensordict)
+            return
+        # GAE knows no mask: show it a rollout whose trajectories end before their padding.
+        shown, after = tensordict.copy(), tensordict.get("next")
+        shown.set("next", after.copy().set(names.done, self._cut(tensordict)))
+        self.value_estimator(shown)
+        for key in (names.advantage, names.value_target, names.value):
+            tensordict.set(key, shown.get(key))
+        after.set(names.value, shown.get(_next(names.value)))
+
     def _estimate(self, tensordict: TensorDictBase) -> torch.Tensor:
         names = self.tensor_keys
         outputs = self.collision_network(tensordict.select(*self.collision_network.in_keys))
@@ -295,17 +309,12 @@ class CURAAdvantage(SeededModule, TensorDictModuleBase):
         return outputs.get(names.collision_atoms)
 
     def _mask(self, tensordict: TensorDictBase) -> torch.Tensor | None:
-        mask = tensordict.get(self.tensor_keys.mask, None)
-        return None if mask is None else mask.reshape(*tensordict.batch_size, 1)
+        return read_mask(tensordict, self.tensor_keys.mask)
 
     def _cut(self, tensordict: TensorDictBase) -> torch.Tensor:
         # Where a trajectory ends in the data. Not read from "truncated", which not every environment has and which
         # TorchRL 0.14's PPOTrainer overwrites.
-        done = tensordict.get(_next(self.tensor_keys.done))
-        mask = self._mask(tensordict)
-        if mask is None:
-            return done
-        return done | ~torch.cat([mask[..., 1:, :], mask[..., -1:, :]], -2)
+        return cut_at_padding(tensordict.get(_next(self.tensor_keys.done)), self._mask(tensordict))
 
     def _costs(self, tensordict: TensorDictBase) -> _Costs:
         names = self.tensor_keys

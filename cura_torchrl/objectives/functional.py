@@ -258,7 +258,7 @@ def masked_moments(values: torch.Tensor, mask: torch.Tensor | None = None) -> tu
 
 
 def standardise(advantage: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
-    """Return the z-score that TorchRL's ``GAE(average_gae=True)`` computes, to the last bit.
+    """Return the z-score that TorchRL's ``GAE(average_gae=True)`` computes, without a mask to the last bit.
 
     Args:
         advantage: Advantages of a whole rollout, any shape, at least two of them.
@@ -274,6 +274,8 @@ def standardise(advantage: torch.Tensor, mask: torch.Tensor | None = None) -> to
     if mask is None:
         return (advantage - advantage.mean()) / advantage.std().clamp_min(_GAE_MIN_STD)
     mean, std = masked_moments(advantage, mask)
+    count = mask.sum().to(std.dtype)
+    std = std * (count / (count - 1.0).clamp_min(1.0)).sqrt()
     return ((advantage - mean) / std.clamp_min(_GAE_MIN_STD)).masked_fill(~mask, 0.0)
 
 

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from cura_torchrl import keys
 from cura_torchrl.objectives.energy import energy_distance
 from cura_torchrl.objectives.functional import sr_lambda_targets
+from cura_torchrl.objectives.rollout import cut_at_padding, read_mask
 from cura_torchrl.objectives.seeded import SeededModule
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ class PerceptualObjective(SeededModule):
     in_keys of the privileged network, at root and next       read  in a minibatch those of both networks, at root
     ``("next", "cost")``                                      read  collision indicator, ``[*B, T, 1]``
     ``("next", "done")``, ``("next", "terminated")``          read  ended at all, for good, bool, ``[*B, T, 1]``
+    ``("collector", "mask")``                                 read  optional: steps that are not padding, bool
     ``privileged_target``                                     write SR(lambda) target atoms, shape ``[*B, T, N]``
     ``perceptual_target``                                     write m(s_t), shape ``[*B, T, 1]``
     ``loss_privileged``, ``loss_perceptual``                  write mean energy distances, shape ``[]``
@@ -90,7 +92,7 @@ class PerceptualObjective(SeededModule):
 
     @property
     def rollout_keys(self) -> list[NestedKey]:
-        """Keys that :meth:`targets` reads."""
+        """Keys that :meth:`targets` reads, the optional mask excepted."""
         seen = self.privileged_network.in_keys
         return [*seen, *(("next", key) for key in (*seen, keys.COST, "done", "terminated"))]
 
@@ -116,7 +118,7 @@ class PerceptualObjective(SeededModule):
             now.get(keys.PRIVILEGED_ATOMS),
             after.get(keys.PRIVILEGED_ATOMS),
             tensordict.get(("next", "terminated")),
-            tensordict.get(("next", "done")),
+            cut_at_padding(tensordict.get(("next", "done")), read_mask(tensordict)),
             gamma=self.gamma,
             lmbda=self.lmbda,
             generator=self.generator,
@@ -129,7 +131,8 @@ class PerceptualObjective(SeededModule):
         """Return the losses of both estimators; the gradient of each reaches its own estimator alone.
 
         Args:
-            tensordict: Minibatch that :meth:`targets` has been applied to, shape ``[B]``; it is not changed.
+            tensordict: Minibatch that :meth:`targets` has been applied to, without padding, shape ``[B]``; it is not
+                changed.
 
         Returns:
             ``loss_privileged`` and ``loss_perceptual`` [1], shape ``[]``.

@@ -257,8 +257,7 @@ def test_padding_counts_for_nothing() -> None:
     padded["next", "done"][:, 10:] = False
     padded["collector", "mask"] = (torch.arange(STEPS) < 10).expand(ENVS, STEPS)
     out = estimate(padded)
-    # The masked z-score divides by the population's deviation, GAE's by the sample's: n = 60.
-    assert torch.allclose(out["advantage"][:, :10] * (59 / 60) ** 0.5, expected["advantage"], atol=1e-4)
+    torch.testing.assert_close(out["advantage"][:, :10], expected["advantage"], rtol=0.0, atol=1e-5)
     assert torch.count_nonzero(out["advantage"][:, 10:]) == 0
     assert torch.allclose(out["collision_target"][:, :10], expected["collision_target"])
 
@@ -273,6 +272,24 @@ def test_padding_after_an_open_trajectory_does_not_reach_its_targets() -> None:
     rollout["next", "cost"][:, 10:] = 1.0
     rollout["collector", "mask"] = (torch.arange(STEPS) < 10).expand(ENVS, STEPS).unsqueeze(-1)
     assert torch.allclose(estimate(rollout)["collision_target"][:, :10], expected)
+
+
+@pytest.mark.parametrize("options", [{}, {"risk_coeff": 0.0, "uncertainty_coeff": 0.0}])
+def test_padding_after_an_open_trajectory_does_not_reach_its_advantage(options: dict[str, float]) -> None:
+    """Catches an advantage or value target that runs on from a trajectory's last step, not done, into its padding."""
+    estimate = CURAAdvantage(*_networks(), **options)
+    rollout = _rollout()
+    for flag in ("done", "terminated"):
+        rollout["next", flag] = torch.zeros(ENVS, STEPS, 1, dtype=torch.bool)
+    expected = estimate(rollout[:, :10].clone())
+    rollout["next", "reward"][:, 10:] = 1e3
+    rollout["collector", "mask"] = (torch.arange(STEPS) < 10).expand(ENVS, STEPS)
+    before = rollout.clone()
+    out = estimate(rollout)
+    for key in ("advantage", "value_target", "state_value", ("next", "state_value")):
+        # Sums of ten floats, about 5.
+        torch.testing.assert_close(out[key][:, :10], expected[key], rtol=0.0, atol=1e-5)
+    assert all(torch.equal(out[key], before[key]) for key in before.keys(True, True))
 
 
 def test_keys_can_be_nested() -> None:

@@ -75,6 +75,20 @@ def test_targets_follow_the_estimator_that_sees_the_state() -> None:
     torch.testing.assert_close(data["perceptual_target"][0], torch.tensor([[0.3], [1.0]]))
 
 
+def test_padding_after_an_open_trajectory_does_not_reach_its_targets() -> None:
+    """Catches targets that run on from a trajectory's last step, which is not done, into its padding."""
+    torch.manual_seed(0)
+    seen = {"observation": torch.rand(2, 8, 1), "obstacle_code": torch.rand(2, 8, 1)}
+    no = torch.zeros(2, 8, 1, dtype=torch.bool)
+    data = TensorDict({**seen, "next": {**seen, "cost": no.float(), "done": no, "terminated": no}}, [2, 8])
+    objective = make_objective()
+    objective.lmbda = 1.0
+    expected = objective.targets(data[:, :5].clone())["privileged_target"]
+    data["next", "cost"][:, 5:] = 1.0
+    data["collector", "mask"] = (torch.arange(8) < 5).expand(2, 8)
+    torch.testing.assert_close(objective.targets(data)["privileged_target"][:, :5], expected)
+
+
 @pytest.mark.parametrize("name", ["privileged", "perceptual"])
 def test_each_loss_trains_its_own_estimator(name: str) -> None:
     """Catches an expectation that is made easy to predict in place of being right."""
