@@ -12,6 +12,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from cura_torchrl import keys
 from cura_torchrl.objectives.energy import energy_distance
+from cura_torchrl.objectives.rollout import require_keys
 
 if TYPE_CHECKING:
     import torch
@@ -132,7 +133,7 @@ class CURALoss(ClipPPOLoss):
             Weighted energy distance per sample [1], shape ``[B, 1]``, not reduced.
 
         Raises:
-            KeyError: If the minibatch has no collision target.
+            KeyError: If the minibatch has no collision target, or the network writes no atoms.
         """
         target = tensordict.get(self.tensor_keys.collision_target, None)
         if target is None:
@@ -147,5 +148,7 @@ class CURALoss(ClipPPOLoss):
             else contextlib.nullcontext()
         ):
             outputs = self.collision_network(tensordict.select(*self.collision_network.in_keys))
-        prediction = outputs.get(self.tensor_keys.collision_atoms)
+        atoms = self.tensor_keys.collision_atoms
+        require_keys([atoms], outputs.keys(True, True), "networks that write it, or another key by set_keys")
+        prediction = outputs.get(atoms)
         return self.collision_coeff * energy_distance(prediction, target.detach()).unsqueeze(-1)

@@ -22,7 +22,7 @@ from cura_torchrl.objectives.functional import (
     standardise,
     uncertainty_cost,
 )
-from cura_torchrl.objectives.rollout import MASK, cut_at_padding, read_mask
+from cura_torchrl.objectives.rollout import MASK, cut_at_padding, read_mask, require_keys
 from cura_torchrl.objectives.seeded import SeededModule
 
 if TYPE_CHECKING:
@@ -229,8 +229,14 @@ class CURAAdvantage(SeededModule, TensorDictModuleBase):
 
         Returns:
             The same tensordict.
-        """
+
+        Raises:
+            KeyError: If the rollout or the collision network lacks a key; nothing has been written then.
+        """  # noqa: DOC502 - raised by what this calls
         names = self.tensor_keys
+        require_keys(self.in_keys, tensordict.keys(True, True), "rollouts that hold it, or another key by set_keys")
+        written = (names.collision_atoms, names.risk, names.uncertainty)
+        require_keys(written, self.collision_network.out_keys, "networks that write it, or another key by set_keys")
         self._estimate_advantage(tensordict)
         atoms = self._estimate(tensordict)
         next_atoms = self._estimate(tensordict.get("next"))

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from cura_torchrl import keys
 from cura_torchrl.objectives.energy import energy_distance
 from cura_torchrl.objectives.functional import sr_lambda_targets
-from cura_torchrl.objectives.rollout import cut_at_padding, read_mask
+from cura_torchrl.objectives.rollout import cut_at_padding, read_mask, require_keys
 from cura_torchrl.objectives.seeded import SeededModule
 
 if TYPE_CHECKING:
@@ -111,7 +111,11 @@ class PerceptualObjective(SeededModule):
 
         Returns:
             The same tensordict.
-        """
+
+        Raises:
+            KeyError: If the rollout lacks a key.
+        """  # noqa: DOC502 - raised by what this calls
+        require_keys(self.rollout_keys, tensordict.keys(True, True), "rollouts that hold it")
         now, after = self._state(tensordict), self._state(tensordict.get("next"))
         targets = sr_lambda_targets(
             tensordict.get(("next", keys.COST)),

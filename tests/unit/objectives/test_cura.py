@@ -274,3 +274,16 @@ def test_a_hand_written_loop_learns_to_predict_collisions() -> None:
     position = torch.tensor([[0.0], [0.95]])
     risk = estimator(torch.cat([position, position.square(), torch.full((2, 1), 0.25)], -1))[1].flatten()
     assert risk[1] > risk[0] + 0.2
+
+
+def test_a_network_that_writes_other_keys_is_named() -> None:
+    """Catches a missing tensor as the only sign of an estimator with other out_keys."""
+    actor, critic, _ = _networks()
+    other = DistributionalCollisionEstimator(
+        OBSERVATION + LATENT, num_atoms=ATOMS, hidden_sizes=(8,), out_keys=("atoms", "risk", "uncertainty")
+    )
+    loss = CURALoss(actor, critic, other)
+    with pytest.raises(KeyError, match=r"'collision_atoms' is missing; accepted: .* set_keys"):
+        loss(_batch())
+    loss.set_keys(collision_atoms="atoms")
+    assert loss(_batch())["loss_collision"].isfinite()

@@ -292,6 +292,30 @@ def test_padding_after_an_open_trajectory_does_not_reach_its_advantage(options: 
     assert all(torch.equal(out[key], before[key]) for key in before.keys(True, True))
 
 
+def test_a_rollout_without_the_cost_is_refused_before_anything_is_written() -> None:
+    """Catches an error that does not name what is missing, and a rollout that is left half done."""
+    estimate = CURAAdvantage(*_networks())
+    rollout = _rollout()
+    del rollout["next", "cost"]
+    before = set(rollout.keys(True, True))
+    with pytest.raises(KeyError, match=r"\('next', 'cost'\) is missing; accepted: .* set_keys"):
+        estimate(rollout)
+    assert set(rollout.keys(True, True)) == before
+
+
+def test_a_network_that_writes_other_keys_is_refused_before_anything_is_written() -> None:
+    """Catches an estimator of other out_keys that fails on a missing tensor; set_keys tells them."""
+    critic, _ = _networks()
+    other = DistributionalCollisionEstimator(5, hidden_sizes=(16,), out_keys=("atoms", "risk", "uncertainty"))
+    estimate, rollout = CURAAdvantage(critic, other), _rollout()
+    before = set(rollout.keys(True, True))
+    with pytest.raises(KeyError, match=r"'collision_atoms' is missing; accepted: .* set_keys"):
+        estimate(rollout)
+    assert set(rollout.keys(True, True)) == before
+    estimate.set_keys(collision_atoms="atoms")
+    assert estimate(rollout)["collision_target"].shape == (ENVS, STEPS, 50)
+
+
 def test_keys_can_be_nested() -> None:
     """Catches a hard-coded key anywhere between GAE, costs and targets."""
     critic, estimator = _networks()

@@ -89,6 +89,14 @@ def test_padding_after_an_open_trajectory_does_not_reach_its_targets() -> None:
     torch.testing.assert_close(objective.targets(data)["privileged_target"][:, :5], expected)
 
 
+def test_a_rollout_without_the_cost_is_refused() -> None:
+    """Catches an error that does not name what is missing."""
+    data = hidden_coins()
+    del data["next", "cost"]
+    with pytest.raises(KeyError, match=r"\('next', 'cost'\) is missing"):
+        make_objective().targets(data)
+
+
 @pytest.mark.parametrize("name", ["privileged", "perceptual"])
 def test_each_loss_trains_its_own_estimator(name: str) -> None:
     """Catches an expectation that is made easy to predict in place of being right."""
