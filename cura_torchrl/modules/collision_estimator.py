@@ -67,7 +67,7 @@ class DistributionalCollisionEstimator(TensorDictModule):
         ValueError: If there is no atom, or ``out_keys`` are not three.
 
     Source:
-        Paper Eq. (3) to (5).
+        Paper Eq. (3) to (6).
 
     Examples:
         >>> from tensordict import TensorDict

@@ -29,7 +29,7 @@ def quantile_midpoints(num_atoms: int, *, dtype: torch.dtype = torch.float32) ->
         ValueError: If there is no atom.
 
     Source:
-        Paper Eq. (3).
+        Paper Eq. (4).
 
     Examples:
         >>> quantile_midpoints(4).tolist()
@@ -51,7 +51,7 @@ def atom_mean(atoms: torch.Tensor) -> torch.Tensor:
         Mean [1], shape ``[*B]``.
 
     Source:
-        Paper Eq. (4).
+        Paper Eq. (5).
 
     Examples:
         >>> atom_mean(torch.tensor([[0.0, 1.0], [0.5, 1.0]])).tolist()
@@ -70,7 +70,7 @@ def atom_variance(atoms: torch.Tensor) -> torch.Tensor:
         Variance, divided by N and not by N - 1 [1], shape ``[*B]``.
 
     Source:
-        Paper Eq. (5).
+        Paper Eq. (6).
 
     Examples:
         >>> atom_variance(torch.tensor([[0.0, 1.0], [0.5, 0.5]])).tolist()

@@ -45,7 +45,7 @@ class CURALoss(ClipPPOLoss):
         **kwargs: Keyword arguments of ``ClipPPOLoss``.
 
     Source:
-        Paper Eq. (6) and (9), Algorithm 1.
+        Paper Eq. (7) and (10), Algorithm 1.
 
     Examples:
         >>> from cura_torchrl.modules import DistributionalCollisionEstimator, make_actor, make_critic

@@ -89,7 +89,7 @@ class CURAAdvantage(SeededModule, TensorDictModuleBase):
         cost_lmbda: Lambda of an advantage estimate of the costs with discount gamma_c [1]; 0 takes each step's own
             cost, as the paper does.
         cost_baseline: What is subtracted from the costs; the paper has the mean.
-        advantage_scale: Scale of the advantage beside the costs. The letter of paper Eq. (9) is raw.
+        advantage_scale: Scale of the advantage beside the costs. The letter of paper Eq. (10) is raw.
         normalise_sum: Whether to scale the penalised advantage to mean 0 and deviation 1 for the optimiser.
         shuffle_uncertainty: Whether the rollout's normalised uncertainty costs are dealt out among its steps at random:
             a placebo, with the same distribution and weight but without what it says about an action.
@@ -99,7 +99,7 @@ class CURAAdvantage(SeededModule, TensorDictModuleBase):
         ValueError: If a number, ``advantage_scale`` or ``cost_baseline`` is not acceptable.
 
     Source:
-        Paper Eq. (7) to (9), Algorithm 1.
+        Paper Eq. (8) to (10), Algorithm 1.
 
     Examples:
         >>> from tensordict import TensorDict

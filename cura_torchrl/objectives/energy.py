@@ -23,7 +23,7 @@ def energy_distance(prediction: torch.Tensor, target: torch.Tensor) -> torch.Ten
     Between neighbouring merged atoms F - G is constant, so the integral is a sum over atoms with weights that depend on
     their order alone. Gradients flow through that linear sum and are exact wherever no two atoms are equal.
 
-    Without the absolute values, which the paper's Eq. (6) leaves out, the distance would be unbounded below.
+    Without the absolute values, which the paper's Eq. (7) leaves out, the distance would be unbounded below.
 
     Args:
         prediction: Atoms x in any order, shape ``[*B, N]``.
@@ -36,7 +36,7 @@ def energy_distance(prediction: torch.Tensor, target: torch.Tensor) -> torch.Ten
         ValueError: If the leading shapes differ or a set is empty.
 
     Source:
-        Paper Eq. (6); Székely and Rizzo (2013), "Energy statistics".
+        Paper Eq. (7); Székely and Rizzo (2013), "Energy statistics".
 
     Examples:
         ``2 * (|0 - 1| + |2 - 1|) / 2 - (0 + 2 + 2 + 0) / 4 - 0 = 2 - 1 = 1``:

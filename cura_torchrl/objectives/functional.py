@@ -54,8 +54,8 @@ def sr_lambda_targets(
         ValueError: If the shapes do not fit together.
 
     Source:
-        Paper Sec. III-C; Schneider et al. (2024), "Learning Risk-Aware Quadrupedal Locomotion using Distributional
-        Reinforcement Learning" <https://arxiv.org/abs/2309.14246>.
+        Paper, section "Training the Distributional Collision Estimator"; Schneider et al. (2024), "Learning Risk-Aware
+        Quadrupedal Locomotion using Distributional Reinforcement Learning" <https://arxiv.org/abs/2309.14246>.
 
     Examples:
         Collision at the last of three steps: 0.9^2, 0.9, 1.
@@ -111,7 +111,7 @@ def risk_cost(
         Risk cost C^R [1], shape ``[*B]``; negative where the action lowered the expected collision possibility.
 
     Source:
-        Paper Eq. (7).
+        Paper Eq. (8).
 
     Examples:
         >>> args = torch.tensor([[0.0], [1.0]]), torch.tensor([[0.5], [0.5]]), torch.tensor([[0.5], [0.5]])
@@ -135,7 +135,7 @@ def uncertainty_cost(uncertainty: torch.Tensor, next_uncertainty: torch.Tensor) 
         Uncertainty cost C^U [1], shape ``[*B]``; negative where the next observation is less uncertain.
 
     Source:
-        Paper Eq. (8).
+        Paper Eq. (9).
 
     Examples:
         >>> uncertainty_cost(torch.tensor([0.5]), torch.tensor([0.25])).item()
@@ -223,7 +223,7 @@ def normalise(values: torch.Tensor, *, floor: float, clip: float, mask: torch.Te
         Normalised values [1], shape of ``values``; zero outside the mask and, if it is empty, everywhere.
 
     Source:
-        The bar in paper Eq. (9); floor and clip are ours.
+        The bar in paper Eq. (10); floor and clip are ours.
 
     Examples:
         Mean 2 and population deviation 1 of the two steps that count:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """What tells a method from the others; all else is the same. Source: paper Sec. V."""
+    """What tells a method from the others; all else is the same. Source: paper, section "Experimental Results"."""
 
     label: str
     """Name in tables and figures."""

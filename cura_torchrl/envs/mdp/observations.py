@@ -99,7 +99,7 @@ def observe(  # noqa: PLR0913 - one argument per measured quantity
         Observations, float32, shape ``[N, D]``; D is :func:`observation_size` of A.
 
     Source:
-        Paper, Section "Observation space": o_p, o_o, p_g.
+        Paper, section "Policy Architecture": o_p, o_o, p_g.
     """
     base_yaw = base_pose[..., 2]
     parts = (

@@ -31,7 +31,7 @@ def test_midpoints_are_centred_on_equal_shares() -> None:
 
 
 def test_variance_is_that_of_the_population() -> None:
-    """Catches the sample variance, which is N / (N - 1) too large against the paper's Eq. (5)."""
+    """Catches the sample variance, which is N / (N - 1) too large against the paper's Eq. (6)."""
     assert atom_mean(ATOMS).item() == pytest.approx(0.4)
     assert atom_variance(ATOMS).item() == pytest.approx(1.42 / 5 - 0.4**2)  # 0.284 - 0.16 = 0.124
 

@@ -80,7 +80,7 @@ def test_without_costs_a_broken_estimator_changes_nothing() -> None:
 
 
 def test_the_penalised_advantage_is_the_one_worked_out_by_hand() -> None:
-    """Catches a wrong sign, coefficient, mask or order of normalisation, by the paper's Eq. (7) to (9).
+    """Catches a wrong sign, coefficient, mask or order of normalisation, by the paper's Eq. (8) to (10).
 
     gamma = lmbda = 0 and V = 0, so A = r = 1, 2, 6.
     C^R = 0.9 * 0.4 - 0.2, 0.9 * 0.5 - 0.4, 1 - 0.5 = 0.16, 0.05, 0.5; C^U = 0.12, -0.07, and none at the collision.

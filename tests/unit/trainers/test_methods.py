@@ -8,8 +8,8 @@ import pytest
 
 from cura_torchrl.trainers.methods import EXTENSIONS, METHODS, PRESETS, method
 
-# Paper, Sec. V: (name there, object hides what is behind it, alpha, lambda_r, lambda_u, robot); alpha = 1 is a map
-# without confidence.
+# Paper, section "Experimental Results": (name there, object hides what is behind it, alpha, lambda_r, lambda_u, robot);
+# alpha = 1 is a map without confidence.
 PAPER = {
     "push-no-occlusion": ("Push w/o Occlusion", False, 1.0, 0.0, 0.0, "ridgeback_franka"),
     "push": ("Push w/ Occlusion", True, 1.0, 0.0, 0.0, "ridgeback_franka"),
