@@ -32,7 +32,7 @@ class PushEnv(EnvBase):
 
     Every key it reads and writes is described in :mod:`cura_torchrl.keys`. A row plays the scenarios
     ``first_episode + row``, then every ``episode_stride``-th: which scene an episode is never depends on batch size,
-    worker count or the order of resets.
+    worker count or the order of resets. ``set_seed`` begins this sequence again, with the scenes of the new seed.
 
     Args:
         num_envs: Number of worlds N.
@@ -79,13 +79,12 @@ class PushEnv(EnvBase):
         is_planar = self.config.simulator == "planar"
         # Where the worlds live: PyBullet's on the CPU, whatever the device of the tensordicts.
         self._home = torch.device("cpu") if self.device is None or not is_planar else self.device
-        self._next_episode = torch.arange(num_envs, device=self._home) + first_episode
-        self._is_first = torch.ones(num_envs, dtype=torch.bool, device=self._home)
+        self._first_episode = first_episode
+        self.set_seed(seed)
         self._make_specs()
         self._worlds, self._controller = self._make_worlds()
         self._lidar = Lidar(num_envs, self.config.lidar, self._worlds.cast, self._home)
         self._make_buffers()
-        self.set_seed(seed)
 
     def _make_worlds(self) -> tuple[Worlds, BaseController]:
         config, rows, robot = self.config, self.num_envs, self._robot
@@ -177,12 +176,14 @@ class PushEnv(EnvBase):
     def _sample(self, episodes: torch.Tensor) -> TensorDict:
         task = self.config.task
         return scenarios.sample_scenarios(
-            task.scenario, stream=task.stream, seed=getattr(self, "_scenario_seed", 0), episodes=episodes,
+            task.scenario, stream=task.stream, seed=self._scenario_seed, episodes=episodes,
             max_obstacles=self.max_obstacles, tcp_reach=self._robot.tcp[0],
         )  # fmt: skip
 
     def _set_seed(self, seed: int | None) -> None:
         self._scenario_seed = 0 if seed is None else int(seed)
+        self._next_episode = torch.arange(self.num_envs, device=self._home) + self._first_episode
+        self._is_first = torch.ones(self.num_envs, dtype=torch.bool, device=self._home)
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, *, episodes: torch.Tensor | None = None, **_: Any

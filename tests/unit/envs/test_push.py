@@ -245,6 +245,17 @@ def test_first_episode_and_stride_partition_the_scenes(make):
     assert sorted(torch.cat(played).flatten().tolist()) == list(range(12))
 
 
+def test_a_seed_begins_a_worker_s_own_sequence_again(make):
+    """Catches a seed after which the workers all play the scenes from 0 on, and ages that are spread only once."""
+    env = make(2, make_config(10, task={"random_first_age": True}), first_episode=4, episode_stride=8)
+    played = []
+    for _ in range(2):
+        env.set_seed(7)
+        played.append(play(env, steady(env, 12, *[0.0] * 6)))
+        assert played[-1]["episode"][:, 0].flatten().tolist() == [4, 5]
+    assert_same(*played)
+
+
 def test_first_episodes_may_start_at_spread_ages_of_the_time_limit(make):
     """Catches resets in lockstep, and an age that shortens later episodes or shows in the observed time."""
     env = make(4, make_config(10, task={"random_first_age": True}))
