@@ -13,6 +13,7 @@ from cura_torchrl import keys
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.config import PushEnvConfig
 from cura_torchrl.envs.mdp import scenarios
+from cura_torchrl.envs.mdp.inputs import checked_action, checked_episodes
 from cura_torchrl.envs.mdp.observations import observation_size, observe
 from cura_torchrl.envs.mdp.rewards import REWARD_TERM_NAMES, reward_terms
 from cura_torchrl.envs.mdp.terminations import endings, latch_success, success_flags
@@ -196,10 +197,14 @@ class PushEnv(EnvBase):
 
         Returns:
             What every row observes now.
-        """
+
+        Raises:
+            ValueError: If the episodes are not one index for each row.
+        """  # noqa: DOC502 - raised by what this calls
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = self._all_rows if mask is None else mask.reshape(self.num_envs).nonzero().flatten().to(self._home)
-        self._episode[rows] = self._next_episode[rows] if episodes is None else episodes.reshape(-1).to(rows)[rows]
+        asked = self._next_episode if episodes is None else checked_episodes(episodes, self.num_envs, self._home)
+        self._episode[rows] = asked[rows]
         self._next_episode[rows] = self._episode[rows] + self._stride
         self.scenario[rows] = self._sample(self._episode[rows])
         self._clear(rows)
@@ -283,12 +288,7 @@ class PushEnv(EnvBase):
         self._scan = scan
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = tensordict[keys.ACTION].detach().to(self._home).clamp(-1.0, 1.0)
-        finite = action.isfinite().all(-1)
-        if not bool(finite.all()):
-            rows = (~finite).nonzero().flatten().tolist()
-            msg = f"action is not a number in rows {rows}; accepted: numbers, of which those beyond -1 or 1 are clamped"
-            raise ValueError(msg)
+        action = checked_action(tensordict[keys.ACTION], self._previous_action.shape, self._home)
         before = self.world_state
         to_object = geometry.to_frame(before.base_pose, before.object_position[:, :2])
         self._controller.command(action, to_object, self._worlds.mass_matrix())

@@ -317,6 +317,36 @@ def test_outputs_are_on_the_device_asked_for(make):
     assert make(1).rollout(1).device is None
 
 
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (torch.zeros(2, 5), r"^action has shape \(2, 5\); accepted: \(2, 6\)$"),
+        (torch.zeros(2, 7), r"^action has shape \(2, 7\); accepted: \(2, 6\)$"),
+        (torch.tensor([[0.0] * 6, [float("nan")] * 6]), r"^action is not a number in rows \[1\]"),
+    ],
+)
+def test_an_impossible_action_is_refused_before_anything_moves(make, action, message):
+    """Catches a step of half a batch, after which worlds and counters disagree."""
+    env, twin = make(2), make(2)
+    root, other = env.reset(), twin.reset()
+    with pytest.raises(ValueError, match=message):
+        env.step(root.clone().set("action", action))
+    good = torch.full((2, 6), 0.5)
+    assert_same(*(each.step(data.set("action", good))["next"] for each, data in ((env, root), (twin, other))))
+
+
+@pytest.mark.parametrize(
+    "episodes", [torch.tensor([3]), torch.tensor([3, 4, 5]), torch.tensor([3.0, 4.0]), torch.tensor([3, -1])]
+)
+def test_impossible_episodes_are_refused_before_anything_is_reset(make, episodes):
+    """Catches episodes that are broadcast, rounded or drawn from no scene, and a sequence that goes on from them."""
+    env = make(2)
+    env.reset()
+    with pytest.raises(ValueError, match=r"^episodes are .*; accepted: 2 integers, 0 or more, one for each row$"):
+        env.reset(episodes=episodes)
+    assert env.reset()["episode"].flatten().tolist() == [2, 3]
+
+
 def test_misuse_is_told_in_one_line(make):
     """Catches an empty batch, and a state that is read before there is one."""
     with pytest.raises(ValueError, match=r"^num_envs is 0; accepted: 1 or more$"):
