@@ -68,7 +68,7 @@ class ConfidenceMap(Transform):
     Args:
         config: Decay, extent, window and channels.
         num_rays: Rays per turn [1].
-        max_range: Largest range, and what a miss reads [m].
+        max_range: Largest range [m]. A miss has to read this, more, or infinity; less would be an obstacle there.
         robot_size: Robot's footprint (length, width), a rectangle around the sensor [m].
         in_keys: Keys of the scan and of the sensor's pose.
         object_keys: Keys of the object's pose and footprint; None if there is no known object.
@@ -250,7 +250,8 @@ class ConfidenceMap(Transform):
 
         Raises:
             KeyError: If an in_key is missing.
-        """
+            ValueError: If the scan has another number of rays, or is bounded below ``max_range``.
+        """  # noqa: DOC502 - raised by what this calls
         for key in self.in_keys:
             if unravel_key(key) not in observation_spec.keys(include_nested=True, leaves_only=True):
                 msg = f"environment has no {key!r}; accepted: one that emits {self.in_keys}"
@@ -259,6 +260,10 @@ class ConfidenceMap(Transform):
         require(
             scan.shape[-1] == self.num_rays, "number of rays of the scan", scan.shape[-1], f"num_rays = {self.num_rays}"
         )
+        if isinstance(scan, Bounded):
+            high = scan.space.high
+            is_enough = bool((high >= torch.as_tensor(self.max_range).to(high)).all())
+            require(is_enough, "bound of the scan", high.min().item(), f"max_range = {self.max_range} or more")
         shape = (*scan.shape[:-1], self.num_channels, self.config.window, self.config.window)
         observation_spec[self.out_keys[0]] = Bounded(0.0, 1.0, shape=shape, dtype=torch.float32, device=scan.device)
         return observation_spec

@@ -366,6 +366,15 @@ class TestState:
         with pytest.raises(ValueError, match="accepted: num_rays = 180"):
             TransformedEnv(ScanEnv((0,)), ConfidenceMap(CONFIG, num_rays=180, max_range=MAX_RANGE)).rollout(1)
 
+    def test_a_sensor_of_shorter_range_is_refused(self) -> None:
+        """Catches misses that are drawn as a wall: a ray of 10 m at most, where only 12 m would be a miss."""
+        with pytest.raises(ValueError, match=r"bound of the scan is 10\.0; accepted: max_range = 12\.0 or more"):
+            TransformedEnv(ScanEnv((0,)), ConfidenceMap(CONFIG, num_rays=NUM_RAYS, max_range=12.0)).rollout(1)
+        # A longer one is cut off: what lies beyond is a miss.
+        window = TransformedEnv(ScanEnv((0,)), ConfidenceMap(CONFIG, num_rays=NUM_RAYS, max_range=0.9)).rollout(1)
+        assert window["confidence_map"][:, :, 0].any()
+        assert not window["confidence_map"][:, :, 1].any()
+
     def test_an_environment_without_a_scan_is_refused(self) -> None:
         """Catches a map that stays empty without a word."""
         env = TransformedEnv(ScanEnv((0,)), make_map(in_keys=("other", "sensor_pose")))
