@@ -70,10 +70,13 @@ COLLISION_ATOMS = "collision_atoms"
 """The DCE's N atoms of the collision possibility C, unsorted, shape ``[*, N]``."""
 
 RISK = "risk"
-"""Mean of the collision atoms, paper Eq. (5), shape ``[*, 1]``."""
+"""Risk measure of the collision atoms, in the paper their mean, Eq. (5), shape ``[*, 1]``."""
 
 UNCERTAINTY = "uncertainty"
-"""Population variance of the collision atoms, paper Eq. (6), shape ``[*, 1]``."""
+"""Population variance of the collision atoms, paper Eq. (6), shape ``[*, 1]``.
+
+With ``CURAConfig.uncertainty = "perceptual"`` that of the perceptual atoms.
+"""
 
 OBSTACLE_CODE = "obstacle_code"
 """True obstacles for an estimator that sees all of them, shape ``[*, 24]``; see ``trainers.privileged.ObstacleCode``.

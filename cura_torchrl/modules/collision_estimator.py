@@ -59,7 +59,7 @@ class DistributionalCollisionEstimator(TensorDictModule):
         observation_norm: Normalisation of the first input, shared by reference.
         risk_measure: What to read as risk from the atoms, such as
             :func:`~cura_torchrl.modules.make_risk_measure` returns; the paper takes the mean. This alone decides: the
-            risk cost, logs and pictures read what the estimator writes.
+            risk cost and the logs read what the estimator writes.
         in_keys: Keys of the inputs, the observation first.
         out_keys: Keys of atoms, risk and uncertainty.
 

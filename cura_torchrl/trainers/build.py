@@ -112,7 +112,7 @@ class Networks(nn.Module):
 
     @property
     def collision_network(self) -> TensorDictModule:
-        """What writes atoms, risk and the uncertainty that the costs, logs and pictures read."""
+        """What writes atoms, risk and the uncertainty that the costs and logs read."""
         if self.perceptual_estimator is None:
             return self.collision_estimator
         # The second overwrites the first one's uncertainty.
