@@ -238,13 +238,12 @@ class CURAAdvantage(SeededModule, TensorDictModuleBase):
         written = (names.collision_atoms, names.risk, names.uncertainty)
         require_keys(written, self.collision_network.out_keys, "networks that write it, or another key by set_keys")
         self._estimate_advantage(tensordict)
-        atoms = self._estimate(tensordict)
+        self._estimate(tensordict)
         next_atoms = self._estimate(tensordict.get("next"))
         cost = tensordict.get(_next(names.cost))
         terminated = tensordict.get(_next(names.terminated))
         targets = sr_lambda_targets(
             cost,
-            atoms,
             next_atoms,
             terminated,
             self._cut(tensordict),

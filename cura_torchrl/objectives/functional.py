@@ -13,7 +13,6 @@ _MIN_SPREAD = 1e-9
 
 def sr_lambda_targets(
     cost: torch.Tensor,
-    atoms: torch.Tensor,
     next_atoms: torch.Tensor,
     terminated: torch.Tensor,
     truncated: torch.Tensor,
@@ -38,7 +37,6 @@ def sr_lambda_targets(
 
     Args:
         cost: Collision indicator c_t [1], shape ``[*B, T, 1]``.
-        atoms: Estimator's atoms at o_t, shape ``[*B, T, N]``; only their shape is used, it is that of the targets.
         next_atoms: Estimator's atoms at o_(t+1), the true last observation where an episode ended, shape
             ``[*B, T, N]``.
         terminated: Whether the episode ended for good at step t, bool, shape ``[*B, T, 1]``.
@@ -62,14 +60,14 @@ def sr_lambda_targets(
 
         >>> end = torch.tensor([[False], [False], [True]])
         >>> zeros = torch.zeros(3, 1)
-        >>> sr_lambda_targets(end.float(), zeros, zeros, end, ~end & False, gamma=0.9, lmbda=1.0).squeeze(-1)
+        >>> sr_lambda_targets(end.float(), zeros, end, ~end & False, gamma=0.9, lmbda=1.0).squeeze(-1)
         tensor([0.8100, 0.9000, 1.0000])
     """
-    if not _is_rollout(atoms, next_atoms, cost, terminated, truncated):
-        shapes = ", ".join(str(tuple(x.shape)) for x in (cost, atoms, next_atoms, terminated, truncated))
+    if not _is_rollout(next_atoms, cost, terminated, truncated):
+        shapes = ", ".join(str(tuple(x.shape)) for x in (cost, next_atoms, terminated, truncated))
         msg = (
-            f"cost, atoms, next_atoms, terminated, truncated have shapes {shapes}; "
-            "accepted: [*B, T, 1], twice [*B, T, N], and twice [*B, T, 1], with T at least 1"
+            f"cost, next_atoms, terminated, truncated have shapes {shapes}; "
+            "accepted: [*B, T, 1], [*B, T, N], and twice [*B, T, 1], with T at least 1"
         )
         raise ValueError(msg)
     with torch.no_grad():
@@ -88,9 +86,9 @@ def sr_lambda_targets(
         return torch.stack(targets[::-1], -2)
 
 
-def _is_rollout(atoms: torch.Tensor, next_atoms: torch.Tensor, *signals: torch.Tensor) -> bool:
-    fits = next_atoms.ndim >= 2 and next_atoms.shape[-2] > 0 and atoms.shape == next_atoms.shape
-    return fits and all(signal.shape == (*next_atoms.shape[:-1], 1) for signal in signals)
+def _is_rollout(next_atoms: torch.Tensor, *signals: torch.Tensor) -> bool:
+    has_steps = next_atoms.ndim >= 2 and next_atoms.shape[-2] > 0
+    return has_steps and all(signal.shape == (*next_atoms.shape[:-1], 1) for signal in signals)
 
 
 def risk_cost(

@@ -119,7 +119,6 @@ class PerceptualObjective(SeededModule):
         now, after = self._state(tensordict), self._state(tensordict.get("next"))
         targets = sr_lambda_targets(
             tensordict.get(("next", keys.COST)),
-            now.get(keys.PRIVILEGED_ATOMS),
             after.get(keys.PRIVILEGED_ATOMS),
             tensordict.get(("next", "terminated")),
             cut_at_padding(tensordict.get(("next", "done")), read_mask(tensordict)),

@@ -42,7 +42,7 @@ def _ten_steps(rollouts: int, atoms: int, lmbda: float) -> torch.Tensor:
     zeros = torch.zeros(rollouts, STEPS, atoms)
     generator = torch.Generator().manual_seed(0)
     return sr_lambda_targets(
-        end.float(), zeros, zeros, end, torch.zeros_like(end), gamma=GAMMA, lmbda=lmbda, generator=generator
+        end.float(), zeros, end, torch.zeros_like(end), gamma=GAMMA, lmbda=lmbda, generator=generator
     )
 
 

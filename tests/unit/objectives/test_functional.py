@@ -60,7 +60,7 @@ def _targets(lmbda: float, atoms: list[float], ends: dict[int, str], costs: list
     """Targets with gamma 0.5 of one atom a step; ``ends`` maps steps to terminated or truncated."""
     flags = {kind: torch.tensor([[ends.get(t) == kind] for t in range(len(costs))]) for kind in ("term", "trunc")}
     z = _column(*atoms)
-    return sr_lambda_targets(_column(*costs), z, z, flags["term"], flags["trunc"], gamma=0.5, lmbda=lmbda).squeeze(-1)
+    return sr_lambda_targets(_column(*costs), z, flags["term"], flags["trunc"], gamma=0.5, lmbda=lmbda).squeeze(-1)
 
 
 def test_one_step_targets_bootstrap_everywhere_but_after_the_end() -> None:
@@ -84,7 +84,7 @@ def test_a_step_both_terminated_and_truncated_is_terminal() -> None:
     """Catches a bootstrap when a collision falls on the time limit."""
     both = torch.tensor([[True]])
     z = torch.tensor([[0.7, 0.9]])
-    targets = sr_lambda_targets(torch.ones(1, 1), z, z, both, both, gamma=0.9, lmbda=0.95)
+    targets = sr_lambda_targets(torch.ones(1, 1), z, both, both, gamma=0.9, lmbda=0.95)
     assert targets.tolist() == [[1.0, 1.0]]
 
 
@@ -92,7 +92,7 @@ def test_bootstrapped_atoms_are_clamped_to_the_range_of_the_collision_possibilit
     """Catches targets that chase an unbounded head out of [0, 1]."""
     no = torch.zeros(1, 1, dtype=torch.bool)
     z = torch.tensor([[-3.0, 0.5, 7.0]])
-    targets = sr_lambda_targets(torch.zeros(1, 1), z, z, no, no, gamma=0.9, lmbda=0.5)
+    targets = sr_lambda_targets(torch.zeros(1, 1), z, no, no, gamma=0.9, lmbda=0.5)
     assert targets.tolist()[0] == pytest.approx([0.0, 0.45, 0.9])
 
 
@@ -100,7 +100,7 @@ def test_a_broken_estimator_does_not_touch_terminal_targets() -> None:
     """Catches 0 * NaN = NaN in place of a choice."""
     z = torch.full((2, 3), float("nan"))
     end = torch.tensor([[False], [True]])
-    targets = sr_lambda_targets(end.float(), z, z, end, ~end & end, gamma=0.9, lmbda=1.0)
+    targets = sr_lambda_targets(end.float(), z, end, ~end & end, gamma=0.9, lmbda=1.0)
     assert torch.allclose(targets, torch.tensor([[0.9] * 3, [1.0] * 3]))
 
 
@@ -111,7 +111,7 @@ def test_targets_are_repeatable_by_their_generator_and_carry_no_gradient() -> No
 
     def targets(seed: int) -> torch.Tensor:
         source = torch.Generator().manual_seed(seed)
-        return sr_lambda_targets(no.float(), z, z, no, no, gamma=0.9, lmbda=0.5, generator=source)
+        return sr_lambda_targets(no.float(), z, no, no, gamma=0.9, lmbda=0.5, generator=source)
 
     assert torch.equal(targets(3), targets(3))
     assert not torch.equal(targets(3), targets(4))
@@ -122,7 +122,7 @@ def test_equal_sets_are_mixed_without_noise() -> None:
     """Catches shuffled pairing: where return and estimator agree atom by atom, the target is that set again."""
     z = torch.rand(50).expand(2, 8, 50)
     no = torch.zeros(2, 8, 1, dtype=torch.bool)
-    targets = sr_lambda_targets(no.float(), z, z, no, no, gamma=1.0, lmbda=0.5)
+    targets = sr_lambda_targets(no.float(), z, no, no, gamma=1.0, lmbda=0.5)
     assert torch.equal(targets, z)
 
 
@@ -130,9 +130,9 @@ def test_sr_targets_refuse_shapes_that_would_broadcast() -> None:
     """Catches a missing trailing dimension, by which [B, T] flags would broadcast against the atoms."""
     z, good, bad = torch.zeros(4, 8, 8), torch.zeros(4, 8, 1, dtype=torch.bool), torch.zeros(4, 8, dtype=torch.bool)
     with pytest.raises(ValueError, match=r"accepted: \[\*B, T, 1\]"):
-        sr_lambda_targets(good.float(), z, z, bad, good, gamma=0.9, lmbda=0.5)
+        sr_lambda_targets(good.float(), z, bad, good, gamma=0.9, lmbda=0.5)
     with pytest.raises(ValueError, match="at least 1"):
-        sr_lambda_targets(good[:, :0], z[:, :0], z[:, :0], good[:, :0], good[:, :0], gamma=0.9, lmbda=0.5)
+        sr_lambda_targets(good[:, :0], z[:, :0], good[:, :0], good[:, :0], gamma=0.9, lmbda=0.5)
 
 
 def test_risk_cost_drops_the_future_after_the_end() -> None:
