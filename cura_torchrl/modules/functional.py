@@ -7,6 +7,7 @@ not tied to a quantile level. Mean and variance need no order; quantiles and tai
 from __future__ import annotations
 
 import functools
+import math
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -125,10 +126,8 @@ def conditional_value_at_risk(atoms: torch.Tensor, alpha: float) -> torch.Tensor
 
         >>> conditional_value_at_risk(torch.tensor([0.4, 1.0, 0.0, 0.2]), 0.375).item()
         0.800000011920929
-    """
-    if not 0.0 < alpha <= 1.0:
-        msg = f"alpha is {alpha}; accepted: above 0 to 1"
-        raise ValueError(msg)
+    """  # noqa: DOC502 - raised by what this calls
+    _require_share(alpha)
     edges = _cumulative_share(atoms)
     return _distorted_mean(atoms, (edges - (1.0 - alpha)).clamp_min(0.0) / alpha)
 
@@ -167,13 +166,13 @@ def make_risk_measure(
 
     Args:
         kind: The mean, as in the paper, :func:`conditional_value_at_risk` or :func:`wang_risk`.
-        level: alpha of CVaR, beta of Wang's measure [1]; the mean has none.
+        level: alpha of CVaR, above 0 to 1; beta of Wang's measure, 0 or more [1]; the mean has none.
 
     Returns:
         Function from atoms, shape ``[*B, N]``, to the risk, shape ``[*B]``; it can be pickled.
 
     Raises:
-        ValueError: If there is no such measure.
+        ValueError: If there is no such measure, or the level is out of its range.
 
     Examples:
         >>> make_risk_measure("cvar", 0.5)(torch.tensor([0.0, 0.5, 0.25, 1.5])).item()  # (0.5 + 1.0) / 2
@@ -182,11 +181,21 @@ def make_risk_measure(
     if kind == "mean":
         return atom_mean
     if kind == "cvar":
+        _require_share(level)
         return functools.partial(_clamped_cvar, alpha=level)
     if kind == "wang":
+        if not 0.0 <= level < math.inf:
+            msg = f"beta is {level}; accepted: 0 or more"
+            raise ValueError(msg)
         return functools.partial(_clamped_wang, beta=level)
     msg = f"risk measure is {kind!r}; accepted: mean, cvar, wang"
     raise ValueError(msg)
+
+
+def _require_share(alpha: float) -> None:
+    if not 0.0 < alpha <= 1.0:
+        msg = f"alpha is {alpha}; accepted: above 0 to 1"
+        raise ValueError(msg)
 
 
 def _clamped_cvar(atoms: torch.Tensor, alpha: float) -> torch.Tensor:

@@ -119,6 +119,22 @@ def test_wang_by_name_has_the_level_as_its_shift() -> None:
     assert make_risk_measure("wang", 1.0)(torch.tensor([1.0, 0.0])).item() == pytest.approx(0.8413, abs=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("kind", "level", "message"),
+    [
+        ("cvar", 0.0, r"alpha is 0\.0; accepted: above 0 to 1"),
+        ("cvar", 1.5, r"alpha is 1\.5; accepted: above 0 to 1"),
+        ("cvar", math.nan, r"alpha is nan; accepted: above 0 to 1"),
+        ("wang", -0.5, r"beta is -0\.5; accepted: 0 or more"),
+        ("wang", math.nan, r"beta is nan; accepted: 0 or more"),
+    ],
+)
+def test_a_level_out_of_range_is_refused_when_the_measure_is_made(kind: str, level: float, message: str) -> None:
+    """Catches a level that is found to be wrong in the first step of training, or never."""
+    with pytest.raises(ValueError, match=message):
+        make_risk_measure(kind, level)
+
+
 def test_an_unknown_measure_is_refused() -> None:
     """Catches a wrong name that falls back to the mean."""
     with pytest.raises(ValueError, match="risk measure is 'var'; accepted: mean, cvar, wang"):
