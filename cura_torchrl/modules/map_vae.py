@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -10,7 +11,6 @@ from torch.nn import functional as F  # noqa: N812
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
 _ACTIVATIONS = {"relu": nn.ReLU, "elu": nn.ELU}
 
@@ -222,18 +222,19 @@ class MapVAE(nn.Module):
         """
         return torch.sigmoid(self.decode(self.encode(maps)))
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Write sizes and weights; the file appears whole or not at all.
 
         Args:
             path: File to write.
         """
+        path = Path(path)
         partial = path.with_name(f"{path.name}.partial")
         torch.save({"shape": self.shape, "state_dict": self.state_dict()}, partial)
         partial.replace(path)
 
     @classmethod
-    def load(cls, path: Path) -> MapVAE:
+    def load(cls, path: Path | str) -> MapVAE:
         """Return the autoencoder that :meth:`save` has written, in evaluation mode, on the CPU.
 
         Args:

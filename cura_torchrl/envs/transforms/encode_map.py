@@ -86,7 +86,7 @@ class EncodeMap(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         maps = self._read(next_tensordict)
-        codes = self._encode(maps.flatten(0, -4))
+        codes = self._encode(maps.reshape(-1, *maps.shape[-3:]))
         return self._write(next_tensordict, codes.view(*maps.shape[:-3], -1))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:

@@ -139,7 +139,7 @@ class TestMapVAE:
     def test_saved_weights_come_back(self, tmp_path: Path) -> None:
         """Catches sizes that are not stored, and a network that comes back in training mode."""
         vae, maps = small(latent_size=6), torch.rand(2, 2, 20, 20)
-        vae.save(tmp_path / "vae.pt")
+        vae.save(str(tmp_path / "vae.pt"))
         loaded = MapVAE.load(tmp_path / "vae.pt")
         assert not loaded.training
         assert torch.equal(loaded(maps), vae(maps))

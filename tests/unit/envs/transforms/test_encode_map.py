@@ -116,6 +116,13 @@ class TestEncoder:
         buffer.extend(TensorDict({"confidence_map": torch.rand(8, 2, 20, 20)}, [8]))
         assert buffer.sample()["latent"].shape == (4, CODE)
 
+    def test_encodes_one_map_without_a_batch(self) -> None:
+        """Catches a batch dimension that is taken for granted."""
+        transform, maps = EncodeMap(CountingEncoder()), torch.rand(2, 2, 20, 20)
+        batch = transform(TensorDict(confidence_map=maps.clone(), batch_size=[2]))["latent"]
+        single = transform(TensorDict(confidence_map=maps[1].clone()))["latent"]
+        torch.testing.assert_close(single, batch[1])
+
     def test_an_environment_without_a_map_is_refused(self) -> None:
         """Catches a code of nothing."""
         with pytest.raises(KeyError, match="accepted: one that holds"):
