@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import shutil
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from cura_torchrl.trainers.checkpoint import (
     progress_path,
     read_config,
     restore,
+    verify,
     weights_sha256,
     write_checkpoint,
 )
@@ -23,6 +25,7 @@ from cura_torchrl.trainers.config import TrainConfig
 from cura_torchrl.trainers.errors import CheckpointError
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.methods import PRESETS
+from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -122,13 +125,14 @@ def export_policy(source: Path, destination: Path | None = None) -> Path:
         The folder that was written.
 
     Raises:
-        CheckpointError: If there is no checkpoint or it is damaged.
+        CheckpointError: If there is no checkpoint or it is damaged, or ``destination`` holds anything but weights.
     """  # noqa: DOC502 - raised by what this calls
     path = find_checkpoint(source)
     config, record = read_config(path)
+    folder = SHIPPED_FOLDER / config.method if destination is None else destination
+    _require_replaceable(folder)
     networks = Networks(config)
     restore(path, {"networks": networks})
-    folder = SHIPPED_FOLDER / config.method if destination is None else destination
     # Paths of the machine that trained say nothing elsewhere.
     released = config.replace(run_dir=Path("runs") / config.method, encoder=None)
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -137,6 +141,24 @@ def export_policy(source: Path, destination: Path | None = None) -> Path:
         shutil.copyfile(curve, progress_path(folder))
     origin = {name: record[name] for name in ("versions", "commit")}
     return write_checkpoint({"networks": networks}, released, folder, frames=record["frames"], origin=origin)
+
+
+def _require_replaceable(folder: Path) -> None:
+    """Raise unless nothing but weights is lost when a folder is replaced.
+
+    Raises:
+        CheckpointError: If it is not new, empty, or weights as they were written.
+    """
+    is_named = folder.name not in {"", ".."}  # the curve's name is made of it
+    is_run = folder.parent.name == CHECKPOINT_FOLDER
+    if is_named and not is_run:
+        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+            return
+        with contextlib.suppress(CheckpointError):
+            verify(folder)
+            return
+    msg = f"destination is {folder}; accepted: a folder that is new, empty, or holds released weights and nothing else"
+    raise CheckpointError(msg)
 
 
 def _resolve(source: str | Path) -> Path:

@@ -51,6 +51,40 @@ def test_exported_weights_load_by_path_and_act_alike(tmp_path: Path) -> None:
     verify(loaded.path)
 
 
+@pytest.mark.parametrize("kept", ["notes.txt", "SHA256SUMS", "checkpoints/checkpoint-1/notes.txt"])
+def test_a_release_leaves_folders_alone_that_hold_anything_else(tmp_path: Path, kept: str) -> None:
+    """Catches `release --destination .` that deletes a project, or a run."""
+    run, destination = _tiny_release(tmp_path), tmp_path / "mine"
+    file = destination / kept
+    file.parent.mkdir(parents=True)
+    file.write_text("mine", encoding="utf-8")
+    with pytest.raises(CheckpointError, match=r"destination is .*mine; accepted: a folder that is new, empty, or"):
+        export_policy(run, destination)
+    assert file.read_text(encoding="utf-8") == "mine"
+
+
+def test_a_release_replaces_weights_but_not_what_was_put_beside_them(tmp_path: Path) -> None:
+    """Catches a release that works once only, and one that deletes notes that lie among the weights."""
+    run, destination = _tiny_release(tmp_path), tmp_path / "weights" / "push"
+    destination.mkdir(parents=True)
+    for _ in range(2):
+        assert export_policy(run, destination) == destination
+    verify(destination)
+    (destination / "notes.txt").write_text("mine", encoding="utf-8")
+    with pytest.raises(CheckpointError, match="destination is"):
+        export_policy(run, destination)
+    with pytest.raises(CheckpointError, match="destination is"):
+        export_policy(run, next((run / CHECKPOINT_FOLDER).iterdir()))
+    with pytest.raises(CheckpointError, match="destination is"):
+        export_policy(run, Path())
+
+
+def _tiny_release(folder: Path) -> Path:
+    config = method("push").replace(run_dir=folder / "run", perception="none")
+    save_checkpoint({"networks": Networks(config)}, config, config.run_dir / CHECKPOINT_FOLDER, frames=7)
+    return config.run_dir
+
+
 def test_a_policy_plays_on_either_simulator_whatever_it_was_trained_on(tmp_path: Path) -> None:
     """Catches an evaluation that plays where the policy was trained, not where it was asked to."""
     config = method("push").replace(run_dir=tmp_path / "run", perception="none", simulator="planar")
