@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 
-from cura_torchrl.trainers.build import Networks, make_env
+from cura_torchrl.trainers.build import SHIPPED_ENCODER, Networks, make_env
 from cura_torchrl.trainers.checkpoint import (
     find_checkpoint,
     progress_path,
@@ -22,7 +23,7 @@ from cura_torchrl.trainers.checkpoint import (
     write_checkpoint,
 )
 from cura_torchrl.trainers.config import TrainConfig
-from cura_torchrl.trainers.errors import CheckpointError
+from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.methods import PRESETS
 from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
@@ -126,11 +127,13 @@ def export_policy(source: Path, destination: Path | None = None) -> Path:
 
     Raises:
         CheckpointError: If there is no checkpoint or it is damaged, or ``destination`` holds anything but weights.
+        UnavailableError: If its encoder is not the one that is shipped: whoever loads it would play with another.
     """  # noqa: DOC502 - raised by what this calls
     path = find_checkpoint(source)
     config, record = read_config(path)
     folder = SHIPPED_FOLDER / config.method if destination is None else destination
     _require_replaceable(folder)
+    _require_shipped_encoder(config)
     networks = Networks(config)
     restore(path, {"networks": networks})
     # Paths of the machine that trained say nothing elsewhere.
@@ -159,6 +162,25 @@ def _require_replaceable(folder: Path) -> None:
             return
     msg = f"destination is {folder}; accepted: a folder that is new, empty, or holds released weights and nothing else"
     raise CheckpointError(msg)
+
+
+def _require_shipped_encoder(config: TrainConfig) -> None:
+    """Raise unless a policy's encoder is the one that comes with the package, at this path or another.
+
+    Raises:
+        UnavailableError: If it is another or not there.
+    """
+    path = config.encoder
+    if path is None or config.perception != "map":
+        return
+    accepted = f"accepted: what the package ships ({SHIPPED_ENCODER.name}), which released weights are loaded with"
+    if not path.is_file():
+        msg = f"encoder is {path}, which is not there to compare; {accepted}"
+        raise UnavailableError(msg)
+    ours, theirs = (hashlib.sha256(file.read_bytes()).hexdigest() for file in (path, SHIPPED_ENCODER))
+    if ours != theirs:
+        msg = f"encoder is {path}, SHA-256 {ours[:12]}; {accepted}, SHA-256 {theirs[:12]}"
+        raise UnavailableError(msg)
 
 
 def _resolve(source: str | Path) -> Path:

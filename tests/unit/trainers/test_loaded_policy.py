@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import nn
 
+from cura_torchrl.modules import MapVAE
 from cura_torchrl.trainers import checkpoint, loaded_policy
-from cura_torchrl.trainers.build import Networks
+from cura_torchrl.trainers.build import SHIPPED_ENCODER, Networks
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, read_config, save_checkpoint, verify
-from cura_torchrl.trainers.errors import CheckpointError
+from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
 from cura_torchrl.trainers.loaded_policy import export_policy, load_policy
 from cura_torchrl.trainers.methods import method
 from cura_torchrl.trainers.progress import PROGRESS_NAME
@@ -79,8 +82,27 @@ def test_a_release_replaces_weights_but_not_what_was_put_beside_them(tmp_path: P
         export_policy(run, Path())
 
 
-def _tiny_release(folder: Path) -> Path:
-    config = method("push").replace(run_dir=folder / "run", perception="none")
+@pytest.mark.parametrize(
+    ("name", "message"), [("other.pt", "SHA-256 [0-9a-f]{12}; accepted"), ("gone.pt", "not there")]
+)
+def test_a_release_with_another_encoder_is_refused(tmp_path: Path, name: str, message: str) -> None:
+    """Catches released weights that are loaded with an encoder whose codes they have never seen."""
+    MapVAE().save(tmp_path / "other.pt")
+    run = _tiny_release(tmp_path, perception="map", encoder=tmp_path / name)
+    with pytest.raises(UnavailableError, match=f"encoder is .*{name}, .*{message}"):
+        export_policy(run, tmp_path / "push")
+    assert not (tmp_path / "push").exists()
+
+
+def test_a_release_with_a_copy_of_the_shipped_encoder_forgets_its_path(tmp_path: Path) -> None:
+    """Catches a comparison of paths: shipped weights were trained with the file before it came to the package."""
+    copy = shutil.copyfile(SHIPPED_ENCODER, tmp_path / "map_vae.pt")
+    run = _tiny_release(tmp_path, perception="map", encoder=copy)
+    assert read_config(export_policy(run, tmp_path / "push"))[0].encoder is None
+
+
+def _tiny_release(folder: Path, **changes: Any) -> Path:
+    config = method("push").replace(run_dir=folder / "run", **{"perception": "none", **changes})
     save_checkpoint({"networks": Networks(config)}, config, config.run_dir / CHECKPOINT_FOLDER, frames=7)
     return config.run_dir
 
