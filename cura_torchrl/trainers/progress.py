@@ -79,10 +79,12 @@ class Progress:
 
     def _rewrite(self) -> None:
         self._columns = list(dict.fromkeys(name for row in self._rows for name in row))
-        with self._path.open("w", newline="", encoding="utf-8") as file:
+        partial = self._path.with_name(f"{self._path.name}.partial")
+        with partial.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, self._columns, restval="")
             writer.writeheader()
             writer.writerows(map(_rounded, self._rows))
+        partial.replace(self._path)
 
 
 def read_progress(path: Path) -> list[dict[str, float]]:

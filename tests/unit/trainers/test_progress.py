@@ -44,6 +44,22 @@ def test_a_row_that_was_cut_off_is_left_out(tmp_path: Path) -> None:
     assert [entry["frames"] for entry in read_progress(path)] == [100]
 
 
+def test_a_run_killed_while_it_adds_a_column_keeps_its_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a file that is emptied before it is written anew: a kill in between would lose the whole curve."""
+    path, progress = tmp_path / PROGRESS_NAME, Progress(TrainConfig(run_dir=tmp_path), frames=0)
+    for frames in (100, 200):
+        progress.add(row(frames))
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module.csv.DictWriter, "writerows", killed)
+    with pytest.raises(KeyboardInterrupt):
+        progress.add(row(300, extra=1.5))
+    progress.close()
+    assert [entry["frames"] for entry in read_progress(path)] == [100, 200]
+
+
 def test_a_logger_that_is_not_installed_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a traceback from inside of a logger, after the worlds have been built."""
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda _: None)
