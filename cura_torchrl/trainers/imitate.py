@@ -27,10 +27,10 @@ from cura_torchrl import keys
 from cura_torchrl.envs.config import Simulator, require, require_finite
 from cura_torchrl.envs.robots.scripted import ScriptedAvoider, ScriptedPusher
 from cura_torchrl.trainers.build import Networks, make_env
-from cura_torchrl.trainers.checkpoint import save_checkpoint
+from cura_torchrl.trainers.checkpoint import save_checkpoint, sweep
 from cura_torchrl.trainers.config import Perception
 from cura_torchrl.trainers.methods import method
-from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
+from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER, locked, require_no_run
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
@@ -99,7 +99,17 @@ def imitate(config: ImitateConfig) -> Path:
 
     Returns:
         The checkpoint, for ``train --init-from``.
-    """
+
+    Raises:
+        CheckpointError: If ``run_dir`` holds a run, or another process trains there.
+    """  # noqa: DOC502 - raised by what this calls
+    with locked(config.run_dir):
+        sweep(config.run_dir / CHECKPOINT_FOLDER)
+        require_no_run(config.run_dir, "another --run-dir")
+        return _imitate(config)
+
+
+def _imitate(config: ImitateConfig) -> Path:
     torch.manual_seed(config.seed)
     train_config = _train_config(config)
     networks = Networks(train_config)

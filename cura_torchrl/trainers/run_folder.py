@@ -46,6 +46,22 @@ def locked(folder: Path) -> Iterator[None]:
         yield
 
 
+def require_no_run(folder: Path, accepted: str) -> None:
+    """Raise if a folder holds a run, which another would mix with.
+
+    Args:
+        folder: The run's folder; it need not exist.
+        accepted: What to do in place of that, in words.
+
+    Raises:
+        CheckpointError: If there are checkpoints.
+    """
+    checkpoints = folder / CHECKPOINT_FOLDER
+    if checkpoints.is_dir() and any(checkpoints.iterdir()):
+        msg = f"{folder} holds a run already; accepted: {accepted}"
+        raise CheckpointError(msg)
+
+
 def is_locked(folder: Path) -> bool:
     """Return whether a process trains in a folder.
 

@@ -24,7 +24,7 @@ from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NodeLostE
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.progress import Progress
 from cura_torchrl.trainers.ray_backend import RayRollouts, require_ray
-from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER, locked
+from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER, locked, require_no_run
 from cura_torchrl.trainers.warm_start import start_from
 
 if TYPE_CHECKING:
@@ -138,11 +138,8 @@ class _Run:
 
     def _source(self, resume: bool) -> Path | None:
         # The checkpoint to go on from, or None for a run that starts.
-        holds_run = self.folder.is_dir() and any(self.folder.iterdir())
-        if not resume and holds_run:
-            msg = f"{self.config.run_dir} holds a run already; accepted: --resume, or another --run-dir"
-            raise CheckpointError(msg)
         if not resume:
+            require_no_run(self.config.run_dir, "--resume, or another --run-dir")
             return None
         source = find_checkpoint(self.config.run_dir)
         before, _ = read_config(source)

@@ -16,6 +16,7 @@ from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, resto
 from cura_torchrl.trainers.errors import CheckpointError
 from cura_torchrl.trainers.imitate import ImitateConfig, _make_env, _rounds, _train_config, imitate
 from cura_torchrl.trainers.methods import method
+from cura_torchrl.trainers.run_folder import locked
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +130,22 @@ def test_fitting_reduces_the_error_of_the_action(tmp_path, caplog):
             imitate(ImitateConfig(run_dir=folder, num_envs=4, rounds=1, steps=12, epochs=epochs, minibatch_size=16))
         errors.append(caplog.records[0].args[2])
     assert errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize("steps", [2, 9])
+def test_a_folder_that_holds_a_run_is_left_alone(tmp_path, steps):
+    """Catches a second imitation into the same folder: the one with more frames is found, whichever is the newer."""
+    sizes = {"num_envs": 2, "rounds": 1, "epochs": 1, "minibatch_size": 8, "simulator": "planar"}
+    path = imitate(ImitateConfig(run_dir=tmp_path, steps=4, **sizes))
+    with pytest.raises(CheckpointError, match=r"holds a run already; accepted: another --run-dir"):
+        imitate(ImitateConfig(run_dir=tmp_path, steps=steps, **sizes))
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_folder_that_is_trained_in_is_left_alone(tmp_path):
+    """Catches networks that appear among the checkpoints of a run that has only just started."""
+    with locked(tmp_path), pytest.raises(CheckpointError, match=r"is being trained in by another process"):
+        imitate(ImitateConfig(run_dir=tmp_path, num_envs=2, rounds=1, steps=2, epochs=1))
 
 
 def test_a_configuration_that_cannot_be_played_is_refused():
