@@ -29,4 +29,9 @@ class ExportConfig:
             method(self.method)
         require(self.check_steps > 0, "check_steps", self.check_steps, "1 or more")
         is_free = not self.out.exists() or (self.out.is_dir() and not any(self.out.iterdir()))
-        require(is_free, "out", str(self.out), "a folder that is empty or not there")
+        require(
+            is_free and self.out.name not in {"", ".."},
+            "out",
+            str(self.out),
+            "a folder that is empty or not there, by its name",
+        )

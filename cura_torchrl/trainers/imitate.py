@@ -89,6 +89,7 @@ class ImitateConfig:
         for name in ("num_envs", "rounds", "steps", "epochs", "minibatch_size", "lr", "std"):
             require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
         require(self.noise >= 0, "noise", self.noise, "a number that is not negative")
+        _train_config(self)  # what the method, the networks and the seed refuse
 
 
 def imitate(config: ImitateConfig) -> Path:

@@ -22,6 +22,7 @@ from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.envs.transforms import ConfidenceMap
 from cura_torchrl.modules.map_vae import MapVAE, map_vae_loss
 from cura_torchrl.trainers.decoding import encode
+from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.info import git_commit, versions
 from cura_torchrl.trainers.map_dataset import MapDataset, RandomPusher, collect_maps, unpack_maps, unpacking_table
 
@@ -116,6 +117,8 @@ class PretrainMapConfig:
             "threads",
         ):
             require(getattr(self, name) >= 1, name, getattr(self, name), "1 or more")
+        require(min(*self.widths, *self.patch) >= 1, "widths, patch", (self.widths, self.patch), "1 or more each")
+        require(0 <= self.seed < 2**31, "seed", self.seed, "0 to 2147483647")
         require(bool(self.simulators), "simulators", self.simulators, "one or more")
         require(0.0 < self.held_out <= 0.5, "held_out", self.held_out, "above 0, up to 0.5")
         require(self.lr > 0 and self.beta >= 0, "lr, beta", (self.lr, self.beta), "positive, not negative")
@@ -162,13 +165,18 @@ def pretrain_map(
 
     Returns:
         Held-out figures, see :func:`measure`.
+
+    Raises:
+        RunError: If the maps are of too few episodes to hold one out and to train on another.
     """
     config.run_dir.mkdir(parents=True, exist_ok=True)
     policy = RandomPusher(noise=config.noise) if policy is None else policy
     data = _maps(config, make_env, policy)
     torch.set_num_threads(config.threads)
     train, held_out = data.split(config.held_out)
-    require(min(len(train), len(held_out)) > 0, "number of maps", len(data.codes), "enough for one held-out episode")
+    if not min(len(train), len(held_out)):
+        msg = f"num_maps is {config.num_maps}, of which {len(held_out)} are held out; accepted: enough for two episodes"
+        raise RunError(msg)
     table = unpacking_table(config.map.decay, config.decays, config.map.channels)
     vae = _train(config, data, train, table)
     figures = {"train_maps": float(len(train)), "held_out_maps": float(len(held_out))}

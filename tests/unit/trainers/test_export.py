@@ -180,6 +180,15 @@ def test_what_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.Monk
         module.export(ExportConfig(method="push", out=tmp_path / "out"))
 
 
+@pytest.mark.parametrize("out", [".", "..", "sub/.."])
+def test_folder_without_a_name_of_its_own_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str) -> None:
+    """Catches a traceback: the export is made beside its folder, under a name made of the folder's."""
+    (tmp_path / "empty" / "sub").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "empty" / "sub")
+    with pytest.raises(ValueError, match=r"out is .*; accepted: a folder that is empty or not there, by its name"):
+        ExportConfig(method="push", out=Path(out))
+
+
 def test_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
     """Catches an export that replaces what somebody kept there."""
     (tmp_path / "notes").write_text("mine", encoding="utf-8")

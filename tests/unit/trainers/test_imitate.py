@@ -148,7 +148,16 @@ def test_a_folder_that_is_trained_in_is_left_alone(tmp_path):
         imitate(ImitateConfig(run_dir=tmp_path, num_envs=2, rounds=1, steps=2, epochs=1))
 
 
-def test_a_configuration_that_cannot_be_played_is_refused():
-    """Catches a run that fails after minutes of collecting."""
-    with pytest.raises(ValueError, match=r"rounds is 0; accepted: a positive number"):
-        ImitateConfig(rounds=0)
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rounds": 0}, r"rounds is 0; accepted: a positive number"),
+        ({"method": "cura-pro"}, r"method is 'cura-pro' \(did you mean cura-ppo\?\)"),
+        ({"seed": -1}, r"seed is -1; accepted: 0 to 2147483647"),
+        ({"std": 0.01}, r"init_std is 0.01; accepted: a number larger than min_std"),
+    ],
+)
+def test_a_configuration_that_cannot_be_played_is_refused(change, message):
+    """Catches a run that fails after minutes of collecting, and a traceback where the command line has one line."""
+    with pytest.raises(ValueError, match=message):
+        ImitateConfig(**change)

@@ -15,6 +15,7 @@ from torchrl.data import Composite, UnboundedDiscrete
 from cura_torchrl.envs.config import MapConfig
 from cura_torchrl.modules.map_vae import MapVAE
 from cura_torchrl.trainers import pretrain_map
+from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.map_dataset import MapDataset, RandomPusher, pack_maps, unpack_maps, unpacking_table
 from cura_torchrl.trainers.pretrain_map import PretrainMapConfig, measure
 from tests.scenes import ScanEnv
@@ -213,6 +214,11 @@ class TestPretrainMap:
         first, second = (MapVAE.load(c.run_dir / pretrain_map.WEIGHTS_NAME).state_dict() for c in (whole, cut))
         for name, value in first.items():
             assert torch.equal(value, second[name]), name
+
+    def test_too_few_maps_are_told_in_one_line(self, tmp_path: Path) -> None:
+        """Catches a traceback: one world that is seen once is one episode, which cannot be split."""
+        with pytest.raises(RunError, match=r"num_maps is 1, of which \d+ are held out; accepted: enough for two"):
+            pretrain_map.pretrain_map(tiny(tmp_path, num_maps=1, num_envs=1), make_env=toy_env, policy=still())
 
     @pytest.mark.parametrize("channels", ["product", "confidence"])
     def test_serves_every_choice_of_channels(self, tmp_path: Path, channels: str) -> None:
