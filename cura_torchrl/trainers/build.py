@@ -30,7 +30,7 @@ from cura_torchrl.modules import (
     make_risk_measure,
 )
 from cura_torchrl.objectives import CURAAdvantage, CURALoss, PerceptualObjective
-from cura_torchrl.trainers.errors import UnavailableError
+from cura_torchrl.trainers.errors import RunError, UnavailableError
 from cura_torchrl.trainers.privileged import CODE_SIZE, ObstacleCode
 from cura_torchrl.trainers.ray_backend import RayRollouts, ray_rollouts
 
@@ -225,6 +225,34 @@ def load_encoder(path: Path | None) -> MapVAE:
         raise UnavailableError(msg) from None
 
 
+def fitting_encoder(config: TrainConfig) -> MapVAE:
+    """Return the frozen encoder of a configuration, which takes its maps and writes the code its networks read.
+
+    Args:
+        config: Map and path of the weights.
+
+    Returns:
+        The encoder.
+
+    Raises:
+        RunError: If it takes other maps, or its code has another length.
+        UnavailableError: If there are no weights, or they are damaged.
+    """  # noqa: DOC502 - raised by what this calls
+    encoder = load_encoder(config.encoder)
+    channels, window = (encoder.shape[name] for name in ("channels", "window"))
+    expected = 2 if config.map.channels == "confidence+occupancy" else 1
+    if (channels, window) != (expected, config.map.window):
+        given = f"map.channels is {config.map.channels!r} and map.window {config.map.window}"
+        takes = f"{channels} x {window} x {window} that the encoder {config.encoder or SHIPPED_ENCODER} takes"
+        flags = "`cura-torchrl pretrain-map --map.channels ... --map.window ...`"
+        msg = f"{given}, maps of {expected} x {config.map.window} x {config.map.window}; accepted: {takes}, or {flags}"
+        raise RunError(f"{msg} and --encoder with what it writes")
+    if encoder.latent_size != LATENT_SIZE:
+        msg = f"code of the encoder {config.encoder} has {encoder.latent_size} numbers; accepted: {LATENT_SIZE}"
+        raise RunError(f"{msg}, as of `cura-torchrl pretrain-map --latent-size {LATENT_SIZE}`")
+    return encoder
+
+
 def make_env(
     config: TrainConfig, num_envs: int, *, keep_map: bool = False, add_obstacle_code: bool = False, **options: Any
 ) -> TransformedEnv:
@@ -247,7 +275,7 @@ def make_env(
     if config.perception == "map" or keep_map:
         transforms.append(ConfidenceMap(config.map, num_rays=lidar.num_rays, max_range=lidar.max_range))
     if config.perception == "map":
-        transforms.append(EncodeMap(load_encoder(config.encoder), del_keys=not keep_map))
+        transforms.append(EncodeMap(fitting_encoder(config), del_keys=not keep_map))
     else:
         transforms.append(ObstacleCode(LATENT_SIZE, is_blind=config.perception == "none"))
     if add_obstacle_code:
@@ -316,7 +344,7 @@ def build_collector(
         "use_buffers": True,
     }
     if config.perception == "map":
-        load_encoder(config.encoder)  # what is wrong with it is told here, and not by each worker
+        fitting_encoder(config)  # what is wrong with it is told here, and not by each worker
     with ExitStack() as stack:
         if config.backend == "ray":
             yield stack.enter_context(ray_rollouts(config, make_env, policy, without=without))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torchrl.checkpoint import GlobalRNGState
 
-from cura_torchrl.trainers.build import Networks, build_collector
+from cura_torchrl.trainers.build import Networks, build_collector, fitting_encoder
 from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, restore, save_checkpoint, sweep
 from cura_torchrl.trainers.diagnostics import (
     RecentEpisodes,
@@ -59,11 +59,14 @@ def train(config: TrainConfig, *, resume: bool = False, init_from: Path | None =
         NonFiniteError: If a reward, an observation, a loss or a gradient is not finite; the last checkpoint is intact.
         Interrupted: If SIGINT or SIGTERM asked the run to stop.
         WorkerError: If a process that collects has died, or no node is left that could.
+        RunError: If the encoder does not take the maps.
         UnavailableError: If a part that was asked for is not installed.
     """  # noqa: DOC502 - raised by what this calls
     _require_device(config.device)
     if config.backend == "ray":
         require_ray()
+    if config.perception == "map":
+        fitting_encoder(config)  # what is wrong with it is told before there is a folder
     with locked(config.run_dir), _Signals() as signals:
         return _Run(config, resume=resume, init_from=init_from).loop(signals)
 

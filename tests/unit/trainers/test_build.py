@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import functools
 import pickle
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
 from tensordict import TensorDict
 
+from cura_torchrl.envs.config import MapConfig
+from cura_torchrl.modules import MapVAE
 from cura_torchrl.trainers import build as module
 from cura_torchrl.trainers.build import LATENT_SIZE, Networks, load_encoder, make_env, make_worker_env
-from cura_torchrl.trainers.errors import UnavailableError
+from cura_torchrl.trainers.errors import RunError, UnavailableError
 from cura_torchrl.trainers.methods import method
 from cura_torchrl.trainers.privileged import CODE_SIZE, ObstacleCode
+from cura_torchrl.trainers.train import train
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -112,3 +115,49 @@ def test_privileged_code_tells_the_obstacles_in_the_base_frame() -> None:
     torch.testing.assert_close(code[0, 8:12], torch.tensor([0.2, 0.0, 0.6, 1.0]))
     assert code[0, :8].abs().sum() == 0
     assert code[0, 12:].abs().sum() == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"channels": "product"},
+            r"map.channels is 'product' and map.window 100, maps of 1 x 100 x 100; accepted: 2 x 100",
+        ),
+        (
+            {"channels": "confidence"},
+            r"maps of 1 x 100 x 100; accepted: 2 x 100 x 100 that the encoder .*map_vae.pt takes",
+        ),
+        ({"window": 60}, r"map.window 60, maps of 2 x 60 x 60; accepted: .*pretrain-map --map.channels .* --encoder"),
+    ],
+)
+def test_maps_that_the_encoder_does_not_take_are_told_in_one_line(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    """Catches a traceback of a convolution from inside of the worlds, after a checkpoint has been written."""
+    config = method("push").replace(map=MapConfig(**change), simulator="planar", run_dir=tmp_path / "run")
+    with pytest.raises(RunError, match=message):
+        make_env(config, 1)
+    with pytest.raises(RunError, match=message):
+        train(config)
+    assert not config.run_dir.exists()
+
+
+def test_codes_of_another_length_are_told_in_one_line(tmp_path: Path) -> None:
+    """Catches a traceback of the networks' first layer."""
+    path = tmp_path / "short.pt"
+    MapVAE(latent_size=8).save(path)
+    with pytest.raises(RunError, match=r"code of the encoder .*short.pt has 8 numbers; accepted: 32, as of"):
+        make_env(method("push").replace(encoder=path, simulator="planar"), 1)
+
+
+def test_an_encoder_of_other_maps_plays_with_them(tmp_path: Path) -> None:
+    """Catches a comparison with the shipped encoder in place of the one that is asked for."""
+    path = tmp_path / "small.pt"
+    MapVAE(channels=1, window=40).save(path)
+    shown = MapConfig(channels="product", window=40)
+    env = make_env(method("push").replace(encoder=path, map=shown, simulator="planar"), 1)
+    try:
+        assert env.reset()["latent"].shape == (1, LATENT_SIZE)
+    finally:
+        env.close()
