@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.envs import ExplorationType, set_exploration_type
 from tqdm import tqdm
@@ -82,7 +83,11 @@ class PolicyGraph(nn.Module):
         encoder = load_encoder(loaded.config.encoder).requires_grad_(False)
         self.encoder = encoder.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
         self.actor = loaded.policy[0].module
-        self.collision_estimator = loaded.collision_estimator.module
+        estimator = loaded.collision_estimator
+        # In sequence, the last one writes the uncertainty that costs and pictures read.
+        parts = list(estimator.module) if isinstance(estimator, TensorDictSequential) else [estimator]
+        self.collision_estimator = parts[0].module
+        self.perceptual_estimator = parts[1].module if len(parts) > 1 else None
 
     def forward(self, window: torch.Tensor, observation: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return what a policy step needs.
@@ -96,7 +101,10 @@ class PolicyGraph(nn.Module):
         """
         latent = self.encoder(window)
         loc, _ = self.actor(observation, latent)
-        return loc.clamp(-1.0, 1.0), latent, *self.collision_estimator(observation, latent)
+        atoms, risk, uncertainty = self.collision_estimator(observation, latent)
+        if self.perceptual_estimator is not None:
+            _, _, uncertainty = self.perceptual_estimator(observation, latent)
+        return loc.clamp(-1.0, 1.0), latent, atoms, risk, uncertainty
 
 
 def export(config: ExportConfig) -> Path:

@@ -12,7 +12,7 @@ from cura_torchrl.trainers.info import git_commit, versions
 if TYPE_CHECKING:
     from cura_torchrl.envs.config import RobotConfig
     from cura_torchrl.envs.transforms import ConfidenceMap
-    from cura_torchrl.trainers.config import TrainConfig
+    from cura_torchrl.trainers.config import CURAConfig, TrainConfig
     from cura_torchrl.trainers.loaded_policy import LoadedPolicy
 
 OBSERVATION_PARTS: dict[str, tuple[str, str]] = {
@@ -29,6 +29,11 @@ OBSERVATION_PARTS: dict[str, tuple[str, str]] = {
     "previous_action": ("1", "last action"),
 }
 """Unit and meaning of the parts of the observation, all in the base frame."""
+
+_UNCERTAINTY_MEANINGS = {
+    "total": "population variance of the atoms",
+    "perceptual": "population variance of another estimator's atoms: the part that seeing all obstacles would remove",
+}
 
 
 class Signal(NamedTuple):
@@ -94,10 +99,19 @@ def policy_signals(transform: ConfidenceMap, config: TrainConfig) -> tuple[list[
         Signal("action", (1, size), "1", "base", "mean action, clamped; see action"),
         Signal("latent", (1, LATENT_SIZE), "1", "", "code of the window"),
         Signal("atoms", (1, config.cura.num_atoms), "1", "", "atoms of the collision possibility, in no order"),
-        Signal("risk", (1, 1), "1", "", "mean of the atoms"),
-        Signal("uncertainty", (1, 1), "1", "", "population variance of the atoms"),
+        Signal("risk", (1, 1), "1", "", _risk_meaning(config.cura)),
+        Signal("uncertainty", (1, 1), "1", "", _UNCERTAINTY_MEANINGS[config.cura.uncertainty]),
     ]
     return inputs, outputs
+
+
+def _risk_meaning(cura: CURAConfig) -> str:
+    meanings = {
+        "mean": "mean of the atoms",
+        "cvar": f"mean of the largest {cura.risk_level:g} of the atoms, which are clamped to 0 to 1",
+        "wang": f"mean of the atoms, which are clamped to 0 to 1, after Wang's shift by {cura.risk_level:g}",
+    }
+    return meanings[cura.risk_measure]
 
 
 def describe(loaded: LoadedPolicy, transform: ConfidenceMap) -> dict[str, Any]:

@@ -17,6 +17,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from cura_torchrl import load_policy
@@ -25,6 +26,7 @@ from cura_torchrl.trainers import export as module
 from cura_torchrl.trainers.errors import CheckpointError, RunError, UnavailableError
 from cura_torchrl.trainers.export_config import ExportConfig
 from cura_torchrl.trainers.runner import Runner
+from tests.runs import tiny_run
 
 SENSED = ("scan", "sensor_pose", "object_pose", "object_size", "observation")
 
@@ -67,6 +69,34 @@ def test_graphs_repeat_recorded_episodes(runner: Runner) -> None:
     # A cell between two rays, or a point between two cells, may go to either.
     assert cells <= 4
     assert compared >= 16
+
+
+@pytest.mark.parametrize(
+    ("name", "risk", "uncertainty"),
+    [
+        ("cura-cvar", "mean of the largest 0.25 of the atoms", "population variance of the atoms"),
+        ("cura-perceptual", "mean of the atoms", "variance of another estimator's atoms: the part that seeing"),
+    ],
+)
+def test_methods_beyond_the_paper_are_exported_with_their_own_costs(
+    tmp_path: Path, name: str, risk: str, uncertainty: str
+) -> None:
+    """Catches a crash, and a robot that is told the mean and variance of atoms that it does not get."""
+    run = tiny_run(name, tmp_path)
+    out = module.export(ExportConfig(checkpoint=run, out=tmp_path / "out", check_steps=2))
+    loaded, robot = load_policy(run), Runner(out)
+    (signals,) = (graph["outputs"] for key, graph in robot.description["graphs"].items() if key == "policy")
+    meanings = {signal["name"]: signal["meaning"] for signal in signals}
+    assert risk in meanings["risk"]
+    assert uncertainty in meanings["uncertainty"]
+    _, state = next(module.observations(loaded, 1))
+    found = robot.step(*(state[key].numpy() for key in SENSED))[1:]
+    latent = torch.from_numpy(robot.outputs["latent"])
+    expected = loaded.collision_estimator(TensorDict(observation=state["observation"], latent=latent, batch_size=[1]))
+    assert found == pytest.approx([expected["risk"].item(), expected["uncertainty"].item()], abs=1e-5)
+    atoms = robot.outputs["atoms"][0]
+    differs = abs(found[0] - atoms.mean()) if name == "cura-cvar" else abs(found[1] - atoms.var())
+    assert differs > 1e-4
 
 
 def test_torch_export_repeats_onnx(exported: Path, runner: Runner) -> None:
