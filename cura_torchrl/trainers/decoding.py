@@ -38,6 +38,32 @@ def encode(value: Any) -> Any:
     return value
 
 
+def changed_fields(before: Any, now: Any, path: str = "") -> dict[str, tuple[Any, Any]]:
+    """Return the fields, nested ones included, in which two configurations of a class differ.
+
+    Args:
+        before: A dataclass instance.
+        now: Another one of the same class.
+        path: Key path of the two.
+
+    Returns:
+        Both values as in JSON, by the path of the key.
+
+    Examples:
+        >>> from cura_torchrl.trainers.config import CURAConfig, TrainConfig
+        >>> changed_fields(TrainConfig(), TrainConfig(cura=CURAConfig(gamma=0.5)))
+        {'cura.gamma': (0.9, 0.5)}
+    """
+    found: dict[str, tuple[Any, Any]] = {}
+    for item in dataclasses.fields(before):
+        one, two, name = getattr(before, item.name), getattr(now, item.name), f"{path}{item.name}"
+        if dataclasses.is_dataclass(one) and type(one) is type(two):
+            found |= changed_fields(one, two, f"{name}.")
+        elif one != two:
+            found[name] = (encode(one), encode(two))
+    return found
+
+
 def decode(cls: type[T], data: object, path: str = "") -> T:
     """Build a dataclass from JSON values.
 

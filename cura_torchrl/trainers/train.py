@@ -15,12 +15,20 @@ from torchrl.checkpoint import GlobalRNGState
 
 from cura_torchrl.trainers.build import Networks, build_collector, fitting_encoder
 from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, restore, save_checkpoint, sweep
+from cura_torchrl.trainers.decoding import changed_fields
 from cura_torchrl.trainers.diagnostics import (
     RecentEpisodes,
     finished_episodes,
     rollout_statistics,
 )
-from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NodeLostError, UnavailableError, WorkerError
+from cura_torchrl.trainers.errors import (
+    CheckpointError,
+    Interrupted,
+    NodeLostError,
+    RunError,
+    UnavailableError,
+    WorkerError,
+)
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.progress import Progress
 from cura_torchrl.trainers.ray_backend import RayRollouts, require_ray
@@ -39,6 +47,10 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+_PLACE_FIELDS = {
+    "run_dir", "device", "backend", "num_workers", "learner_threads", "env.simulator", "env.physics.planar_graph"
+}  # fmt: skip
+"""Fields that only say where a run goes on, or follow from another."""
 _DEATH_SIGNS = ("process failed", "failed to initialize", "process object is closed", "Cannot close a process")
 """What TorchRL's and Python's errors say when a worker process has died."""
 
@@ -56,12 +68,17 @@ def train(config: TrainConfig, *, resume: bool = False, init_from: Path | None =
 
     Raises:
         CheckpointError: If a checkpoint is missing or damaged, or ``run_dir`` holds a run that is not to be resumed.
+        RunError: If a run is to be resumed and to start from other networks, or the encoder does not take the maps.
         NonFiniteError: If a reward, an observation, a loss or a gradient is not finite; the last checkpoint is intact.
         Interrupted: If SIGINT or SIGTERM asked the run to stop.
         WorkerError: If a process that collects has died, or no node is left that could.
-        RunError: If the encoder does not take the maps.
         UnavailableError: If a part that was asked for is not installed.
     """  # noqa: DOC502 - raised by what this calls
+    if resume and init_from is not None:
+        msg = (
+            f"init_from is {init_from} beside resume; accepted: --resume, which goes on with the run's own networks, or"
+        )
+        raise RunError(f"{msg} --init-from with another --run-dir")
     _require_device(config.device)
     if config.backend == "ray":
         require_ray()
@@ -149,6 +166,9 @@ class _Run:
         if before.method != self.config.method:
             msg = f"method is {self.config.method!r} but {source} is of {before.method!r}; accepted: the same method"
             raise CheckpointError(msg)
+        for name, (old, new) in changed_fields(before, self.config).items():
+            if name not in _PLACE_FIELDS:
+                logger.info("%s: %s -> %s", name, old, new)
         return source
 
     def loop(self, signals: _Signals) -> Path:

@@ -14,7 +14,14 @@ from cura_torchrl.envs.config import TaskConfig
 from cura_torchrl.trainers import train as module
 from cura_torchrl.trainers.build import Networks, build_collector
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint, read_config
-from cura_torchrl.trainers.errors import CheckpointError, Interrupted, NonFiniteError, UnavailableError, WorkerError
+from cura_torchrl.trainers.errors import (
+    CheckpointError,
+    Interrupted,
+    NonFiniteError,
+    RunError,
+    UnavailableError,
+    WorkerError,
+)
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.run_folder import locked
@@ -107,6 +114,23 @@ def test_networks_may_start_from_another_run(config: TrainConfig, tmp_path: Path
     ours, theirs = before.learner.networks.state_dict(), source.learner.networks.state_dict()
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
     assert (before.learner.frames, source.learner.frames) == (0, 2 * FRAMES)
+
+
+def test_a_run_that_is_resumed_starts_from_no_other(config: TrainConfig, tmp_path: Path) -> None:
+    """Catches networks that were asked for and silently left out."""
+    train(config)
+    with pytest.raises(RunError, match=r"init_from is .*other beside resume; accepted: --resume, .*, or --init-from"):
+        train(config, resume=True, init_from=tmp_path / "other")
+
+
+def test_what_a_resumed_run_does_otherwise_is_told(config: TrainConfig, caplog: pytest.LogCaptureFixture) -> None:
+    """Catches a flag that changes a run in the middle of its curve, of which its log would say nothing."""
+    train(config)
+    loud = {"ppo": dataclasses.replace(config.ppo, entropy_coeff=0.5), "learner_threads": 2, "keep_checkpoints": 2}
+    with caplog.at_level("INFO", logger=module.__name__):
+        train(config.replace(total_frames=3 * FRAMES, **loud), resume=True)
+    told = [record.getMessage() for record in caplog.records if record.name == module.__name__]
+    assert told == ["total_frames: 16 -> 24", "keep_checkpoints: 3 -> 2", "ppo.entropy_coeff: 0.005 -> 0.5"]
 
 
 def test_a_perceptual_run_starts_from_a_method_of_the_paper_and_says_what_is_new(
