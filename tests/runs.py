@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+import pytest
 import torch
 
+from cura_torchrl.envs.config import TaskConfig
 from cura_torchrl.modules import MapVAE
+from cura_torchrl.trainers import evaluation_task
 from cura_torchrl.trainers.build import Networks
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
 from cura_torchrl.trainers.config import NetworkConfig
 from cura_torchrl.trainers.methods import method
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from cura_torchrl.trainers.config import TrainConfig
@@ -38,6 +44,14 @@ def small_run(run_dir: Path, *, updates: int, **changes: Any) -> TrainConfig:
         network=dataclasses.replace(preset.network, **sizes),
         **changes,
     )
+
+
+@contextmanager
+def short_evaluation() -> Iterator[None]:
+    """Evaluate with episodes of one second."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluation_task, "TaskConfig", functools.partial(TaskConfig, episode_time=1.0))
+        yield
 
 
 def tiny_run(name: str, folder: Path) -> Path:

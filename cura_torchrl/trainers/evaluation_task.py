@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import TYPE_CHECKING, Protocol
 
+from cura_torchrl.envs.config import PhysicsConfig, ScenarioConfig, TaskConfig
+
 if TYPE_CHECKING:
-    from cura_torchrl.envs.config import ScenarioKind, TaskConfig
+    from cura_torchrl.envs.config import PushEnvConfig, ScenarioKind
 
 
 class SceneChoice(Protocol):
@@ -29,7 +30,10 @@ class SceneChoice(Protocol):
 
 
 def evaluation_task(task: TaskConfig, config: SceneChoice) -> TaskConfig:
-    """Return a task with the scenes that are evaluated, and the true obstacles in what is emitted.
+    """Return the task that is evaluated, and the true obstacles in what is emitted.
+
+    Objects, obstacles, tolerances and times are the defaults, whatever a policy was trained on: scenes are paired, and
+    outcomes compared, between policies. Of its own a policy has only the time between two actions.
 
     Args:
         task: What the policy was trained on.
@@ -38,10 +42,24 @@ def evaluation_task(task: TaskConfig, config: SceneChoice) -> TaskConfig:
     Returns:
         The task.
     """
-    scenario = dataclasses.replace(
-        task.scenario, kind=config.scenario, object_edges=(config.object_size,), max_obstacles=config.max_obstacles
+    scenario = ScenarioConfig(
+        kind=config.scenario, object_edges=(config.object_size,), max_obstacles=config.max_obstacles
     )
     # The obstacles are there for meters and pictures; a policy reads them only if it says so.
-    return dataclasses.replace(
-        task, scenario=scenario, stream="eval", random_first_age=False, curriculum=(), privileged=True
-    )
+    return TaskConfig(scenario=scenario, stream="eval", privileged=True, policy_period=task.policy_period)
+
+
+def evaluation_physics(env: PushEnvConfig) -> PhysicsConfig:
+    """Return the physics in which policies are evaluated: the defaults, whatever a policy was trained in.
+
+    Args:
+        env: What the policy was trained in; whether the planar simulator captures a graph is kept, and, beside another
+            time between two actions than the default, the clock that divides it.
+
+    Returns:
+        The physics.
+    """
+    kept = ["planar_graph"]
+    if env.task.policy_period != TaskConfig().policy_period:
+        kept += ["control_period", "planar_period"]
+    return PhysicsConfig(**{name: getattr(env.physics, name) for name in kept})

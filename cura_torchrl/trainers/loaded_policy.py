@@ -31,7 +31,7 @@ from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
-    from cura_torchrl.envs.config import Simulator, TaskConfig
+    from cura_torchrl.envs.config import PhysicsConfig, Simulator, TaskConfig
 
 SHIPPED_FOLDER = Path(__file__).parent / "weights"
 """Folder of the weights that come with the package, one folder a method."""
@@ -64,6 +64,7 @@ class LoadedPolicy:
         num_envs: int,
         *,
         task: TaskConfig | None = None,
+        physics: PhysicsConfig | None = None,
         simulator: Simulator | None = None,
         keep_map: bool = False,
         **options: Any,
@@ -73,6 +74,7 @@ class LoadedPolicy:
         Args:
             num_envs: Number of worlds N.
             task: Task to play; None is the trained one with all its obstacles.
+            physics: Clock and contact; None are those of the training.
             simulator: Where to play; None is where the policy was trained.
             keep_map: Whether the window of the map stays in the tensordict under ``confidence_map``.
             **options: Keyword arguments of :class:`~cura_torchrl.envs.push.PushEnv`, such as ``seed``.
@@ -83,7 +85,8 @@ class LoadedPolicy:
         played = self.config.env.task if task is None else task
         played = dataclasses.replace(played, stream="eval", random_first_age=False, curriculum=())
         where = simulator or self.config.simulator
-        env = dataclasses.replace(self.config.env, task=played, simulator=where)
+        trained = self.config.env
+        env = dataclasses.replace(trained, task=played, physics=physics or trained.physics, simulator=where)
         config = self.config.replace(env=env, simulator=where)
         return make_env(config, num_envs, keep_map=keep_map, **options)
 

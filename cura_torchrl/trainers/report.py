@@ -16,7 +16,7 @@ from cura_torchrl.trainers.checkpoint import progress_path
 from cura_torchrl.trainers.demo import draw_card
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.estimate_figures import distribution_figure
-from cura_torchrl.trainers.evaluation_task import evaluation_task
+from cura_torchrl.trainers.evaluation_task import evaluation_physics, evaluation_task
 from cura_torchrl.trainers.folder_section import read_folder
 from cura_torchrl.trainers.loaded_policy import LoadedPolicy, load_policy
 from cura_torchrl.trainers.markup import document
@@ -28,7 +28,6 @@ from cura_torchrl.trainers.threads import one_thread
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from cura_torchrl.envs.config import TaskConfig
     from cura_torchrl.trainers.recording import Recording, Scene
 
 __all__ = ["ReportConfig", "report"]
@@ -141,21 +140,29 @@ def _players(config: ReportConfig, runs: list[Run]) -> list[Run]:
 
 
 def _play(config: ReportConfig, players: list[Run]) -> tuple[Recording, ...]:
-    """Return the scene as each plays it, where and in the task that the first run is trained for."""
+    """Return the scene as each plays it, where the first run is trained."""
     trained = players[0].loaded.config
     task = evaluation_task(trained.env.task, config)
     config = dataclasses.replace(config, simulator=config.simulator or trained.simulator)
     scene = find_scene(task.scenario, seed=config.seed, index=config.scene)
     states = round(task.episode_time / task.policy_period) + 1
     with tqdm(total=states * len(players), desc="play", unit="step", file=sys.stderr) as bar, one_thread():
-        played = tuple(_play_one(config, player, task, scene, bar) for player in players)
+        played = tuple(_play_one(config, player, scene, bar) for player in players)
         bar.update(bar.total - bar.n)
     return played
 
 
-def _play_one(config: ReportConfig, player: Run, task: TaskConfig, scene: Scene, bar: tqdm) -> Recording:
+def _play_one(config: ReportConfig, player: Run, scene: Scene, bar: tqdm) -> Recording:
     loaded = player.loaded
-    env = loaded.make_env(1, task=task, simulator=config.simulator, keep_map=True, seed=config.seed)
+    trained = loaded.config.env
+    env = loaded.make_env(
+        1,
+        task=evaluation_task(trained.task, config),
+        physics=evaluation_physics(trained),
+        simulator=config.simulator,
+        keep_map=True,
+        seed=config.seed,
+    )
     with closing(env):
         (recording,) = record(
             env,

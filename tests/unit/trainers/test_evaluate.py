@@ -5,16 +5,31 @@ from __future__ import annotations
 import dataclasses
 import json
 from contextlib import closing
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
 
-from cura_torchrl.envs.config import MapConfig, PushEnvConfig, TaskConfig
+from cura_torchrl.envs.config import (
+    MapConfig,
+    PhysicsConfig,
+    PushEnvConfig,
+    RobotConfig,
+    ScenarioConfig,
+    TaskConfig,
+)
 from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.trainers import evaluate as module
 from cura_torchrl.trainers.build import Networks, make_env
+from cura_torchrl.trainers.checkpoint import read_config, save_checkpoint
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.evaluate import Episode, Player, evaluate, play_episodes, summarise
+from cura_torchrl.trainers.info import shipped_methods
+from cura_torchrl.trainers.loaded_policy import SHIPPED_FOLDER
+from cura_torchrl.trainers.methods import method
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 REQUIRED = {
     "method", "scenario", "object_size", "episodes", "successes", "success_rate", "wilson_low", "wilson_high",
@@ -108,6 +123,49 @@ def test_what_is_seen_in_a_scene_does_not_depend_on_the_scenes_before_it() -> No
     second, third = windows_of([4, 9, 2])[16:31], windows_of([2, 4, 9])[31:46]
     assert torch.equal(second, third)
     assert not torch.equal(second[0], second[-1])
+
+
+@pytest.mark.parametrize("name", shipped_methods())
+def test_shipped_weights_are_evaluated_on_what_they_were_trained_on(name: str) -> None:
+    """Catches defaults that move away from what the published numbers were played with."""
+    trained = read_config(SHIPPED_FOLDER / name)[0].env
+    scenario = dataclasses.replace(trained.task.scenario, kind="adversarial", object_edges=(0.75,), max_obstacles=3)
+    played = {"stream": "eval", "random_first_age": False, "curriculum": (), "privileged": True}
+    choice = EvaluateConfig(method=name, scenario="adversarial", object_size=0.75, max_obstacles=3)
+    expected = dataclasses.replace(trained.task, scenario=scenario, **played)
+    assert module.evaluation_task(trained.task, choice) == expected
+    assert module.evaluation_physics(trained) == trained.physics
+
+
+def test_all_are_evaluated_on_the_same_task_whatever_they_were_trained_on(tmp_path: Path) -> None:
+    """Catches a light object, a wide goal or a soft floor that a policy takes with it from its training."""
+    task = TaskConfig(
+        scenario=ScenarioConfig(object_mass=(1.0, 1.0), floor_friction=(0.1, 0.1), obstacle_edges=(0.2,)),
+        tolerances=(2.0, 1.0, 0.5),
+        episode_time=200.0,
+    )
+    robot, physics = RobotConfig(max_base_speed=0.6), PhysicsConfig(gravity=1.0, planar_graph=True)
+    preset = method("push").replace(perception="none", simulator="planar", run_dir=tmp_path)
+    env = dataclasses.replace(preset.env, task=task, robot=robot, physics=physics)
+    config = preset.replace(env=env)
+    save_checkpoint({"networks": Networks(config)}, config, tmp_path, frames=1)
+    with closing(Player(EvaluateConfig(checkpoint=tmp_path, simulator="planar", chunk=1))) as player:
+        played = player._env.base_env.config
+    with closing(Player(EvaluateConfig(policy="scripted", simulator="planar", chunk=1))) as player:
+        paired = player._env.base_env.config
+    assert played.task == paired.task
+    assert played.physics == dataclasses.replace(paired.physics, planar_graph=True)
+    assert (played.robot, played.lidar) == (robot, preset.env.lidar)
+
+
+def test_a_policy_that_acts_at_another_rate_keeps_it() -> None:
+    """Catches actions that are held for longer or shorter than in training, and a clock that does not divide it."""
+    physics = PhysicsConfig(control_period=0.01, planar_period=0.025, gravity=1.0)
+    trained = PushEnvConfig(task=TaskConfig(policy_period=0.25), physics=physics)
+    task = module.evaluation_task(trained.task, EvaluateConfig(policy="random"))
+    assert task.policy_period == 0.25
+    clock = PhysicsConfig(control_period=0.01, planar_period=0.025)
+    assert PushEnvConfig(task=task, physics=module.evaluation_physics(trained)).physics == clock
 
 
 @pytest.fixture

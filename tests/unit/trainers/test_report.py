@@ -19,12 +19,20 @@ from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.recording import choose_scenes, find_scene
 from cura_torchrl.trainers.report import ReportConfig, report
 from tests.pages import Reader
-from tests.runs import tiny_run
+from tests.runs import short_evaluation, tiny_run
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" width="4" height="3"/>'
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short() -> Iterator[None]:
+    """Scenes are over after five steps."""
+    with short_evaluation():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ import sys
 import time
 from contextlib import closing
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
@@ -32,11 +33,21 @@ from cura_torchrl.trainers.table_numbers import compare
 from cura_torchrl.trainers.table_parquet import write_parquet
 from cura_torchrl.trainers.table_report import as_csv, as_latex, as_markdown, latex
 from tests.episodes import run_of
-from tests.runs import small_run
+from tests.runs import short_evaluation, small_run
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 METHODS = ("push-no-occlusion", "push", "cura-ppo")
 METHODS_2 = ("push-conf", "cura-no-risk")
 CELLS = ("uniform-0.5", "adversarial-1.0")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short() -> Iterator[None]:
+    """Scenes are over after five steps."""
+    with short_evaluation():
+        yield
 
 
 @pytest.fixture(autouse=True)
@@ -52,12 +63,9 @@ def played(**letters: str) -> dict[str, dict[str, list[list[Episode]]]]:
 
 
 def untrained(folder: Path, method: str, seed: int, frames: int = 8) -> None:
-    """Write the run METHOD-SEED of untrained networks, with episodes of one second."""
+    """Write the run METHOD-SEED of untrained networks."""
     torch.manual_seed(seed)
     config = small_run(folder / f"{method}-{seed}", updates=1, method=method, simulator="planar")
-    config = config.replace(
-        env=dataclasses.replace(config.env, task=dataclasses.replace(config.env.task, episode_time=1.0))
-    )
     save_checkpoint({"networks": Networks(config)}, config, config.run_dir / CHECKPOINT_FOLDER, frames=frames)
 
 
@@ -119,7 +127,7 @@ def test_a_run_that_was_killed_goes_on_and_ends_with_the_same_file(tmp_path: Pat
     """Catches a file that SIGKILL leaves half written, and processes that play on without a parent."""
     untrained(tmp_path, "push", 0)
     flags = ["--methods", "push", "--cells", ",".join(CELLS), "--seeds", "0", "--runs", str(tmp_path)]
-    options = [*flags, "--episodes", "24", "--chunk", "2", "--simulator", "planar", "--num-workers", "2"]
+    options = [*flags, "--episodes", "8", "--chunk", "2", "--simulator", "planar", "--num-workers", "2"]
     command = [sys.executable, "-m", "cura_torchrl.trainers.cli", "table", *options, "--out"]
     killed, whole = tmp_path / "killed" / STORE_NAME, tmp_path / "whole" / STORE_NAME
     with subprocess.Popen(
@@ -131,7 +139,7 @@ def test_a_run_that_was_killed_goes_on_and_ends_with_the_same_file(tmp_path: Pat
         process.send_signal(signal.SIGKILL)
         # The pipe closes when the last of those that hold it has ended: the workers too.
         process.communicate(timeout=60)
-    assert 0 < len(rows_of(killed)) < 48
+    assert 0 < len(rows_of(killed)) < 16
     assert len(rows_of(killed)) % 2 == 0
     pages = [
         subprocess.run([*command, str(path.parent)], capture_output=True, text=True, check=True).stdout

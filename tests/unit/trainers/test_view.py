@@ -13,7 +13,7 @@ from cura_torchrl.trainers.errors import UnavailableError
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.view import View, ViewConfig, play_scene
 from tests.recordings import make_recording
-from tests.runs import tiny_run
+from tests.runs import short_evaluation, tiny_run
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -54,6 +54,13 @@ def test_a_state_is_shown_where_it_is(shown: View) -> None:
     assert tuple(bodies["obstacles/1"].scale) == pytest.approx((0.4, 0.4, 0.4))
     assert "R = 0.500" in shown._text.content
     assert shown._map.image.shape == (300, 300, 3)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short() -> Iterator[None]:
+    """Scenes are over after five steps."""
+    with short_evaluation():
+        yield
 
 
 @pytest.mark.parametrize("recorded", [False, True])
