@@ -15,6 +15,7 @@ NUM_STATES = 7
 
 TRACKS = (
     "base_pose", "tcp", "object_pose", "obstacles", "arm_joints", "object_position", "object_quaternion", "atoms",
+    "risk", "uncertainty",
 )  # fmt: skip
 """What a recording has of every state."""
 
@@ -36,7 +37,8 @@ def make_recording(*, outcome: str = "success", index: int = 4, adversarial: boo
     """Return a drive along the x axis with the object ahead; an obstacle appears at x = 8 m in state 2, after 0.4 s.
 
     The base goes from x = 0 in steps of 0.5 m, the TCP is 0.9 m ahead of it and the object's centre, edge 1 m, 1.5 m;
-    the goal is at (12, 1). The LiDAR sees 5 m all around, atoms are half 0 and half 1.
+    the goal is at (12, 1). The LiDAR sees 5 m all around, atoms are half 0 and half 1; risk and uncertainty are their
+    mean and variance.
     """
     along = 0.5 * np.arange(NUM_STATES)
     zero = np.zeros(NUM_STATES)
@@ -61,5 +63,7 @@ def make_recording(*, outcome: str = "success", index: int = 4, adversarial: boo
         "atoms": np.tile([0.0, 1.0], (NUM_STATES, 25)),
         "scans": np.full((3, 360), 5.0),
     }
+    atoms = changes.get("atoms", values["atoms"])
+    values |= {"risk": atoms.mean(1), "uncertainty": atoms.var(1)}
     arrays = {name: value.astype(np.float32) for name, value in values.items() if isinstance(value, np.ndarray)}
     return Recording(**{**values, **arrays, "frame_steps": np.array([0, 3, 6]), "maps": maps, **changes})

@@ -115,8 +115,12 @@ def _layout(recordings: Sequence[Recording]) -> tuple[list[_Column], Image.Image
         column.confidence.decorate(background, "Confidence M: light = seen")
         column.occupancy.decorate(background, "Occupancy O: dark = occupied")
         column.atoms.decorate(background, "Collision estimate: 50 atoms")
-        column.risk.decorate(background, "Risk R = mean")
-        column.uncertainty.decorate(background, "Uncertainty U = variance")
+        for panel, name, values, moment, meaning in (
+            (column.risk, "Risk R", recording.risk, recording.atoms.mean(1), "mean"),
+            (column.uncertainty, "Uncertainty U", recording.uncertainty, recording.atoms.var(1), "variance"),
+        ):
+            # Methods beyond the paper are charged for others.
+            panel.decorate(background, f"{name} = {meaning}" if np.allclose(values, moment, atol=1e-5) else name)
         place = (index * COLUMN_WIDTH + _LEFT) * SCALE, 18 * SCALE
         draw = ImageDraw.Draw(background)
         draw.text(place, recording.label, fill=raster.INK, font=font(15, bold=True), anchor="ls")

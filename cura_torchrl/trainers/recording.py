@@ -17,7 +17,6 @@ from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
 from cura_torchrl.envs.robots.ridgeback_franka import HOME_TCP
-from cura_torchrl.modules.functional import atom_mean, atom_variance
 from cura_torchrl.trainers.episode_measures import bodies, clearance
 from cura_torchrl.trainers.evaluate import Episode, play_episodes
 
@@ -85,6 +84,10 @@ class Recording:
     """Object's orientation, xyzw, shape ``[T, 4]``."""
     atoms: NDArray[np.float32]
     """The DCE's atoms of the collision possibility C, unsorted [1], shape ``[T, N]``."""
+    risk: NDArray[np.float32]
+    """R that the policy is charged for: the atoms' mean, unless its method has another risk measure [1], shape ``[T]``."""
+    uncertainty: NDArray[np.float32]
+    """U that it is charged for: the atoms' variance, unless its method has another one [1], shape ``[T]``."""
     frame_steps: NDArray[np.int64]
     """States that have scan and map, shape ``[F]``; the last state is one of them."""
     scans: NDArray[np.float32]
@@ -96,16 +99,6 @@ class Recording:
     def times(self) -> NDArray[np.floating]:
         """Time of each state [s], shape ``[T]``."""
         return np.arange(len(self.base_pose)) * self.period
-
-    @cached_property
-    def risk(self) -> NDArray[np.float32]:
-        """R, the atoms' mean [1], shape ``[T]``."""
-        return atom_mean(torch.from_numpy(self.atoms)).numpy()
-
-    @cached_property
-    def uncertainty(self) -> NDArray[np.float32]:
-        """U, the atoms' variance [1], shape ``[T]``."""
-        return atom_variance(torch.from_numpy(self.atoms)).numpy()
 
     @cached_property
     def has_arm(self) -> bool:
@@ -267,7 +260,7 @@ class Recorder:
     """Watches N worlds and keeps what is drawn later.
 
     Args:
-        estimator: The DCE; writes the atoms.
+        estimator: The DCE; writes atoms, risk and uncertainty.
         num_worlds: Worlds N.
         stride: Every how many states scan and map are kept [1].
     """
@@ -299,6 +292,8 @@ class Recorder:
             "object_position": worlds.object_position,
             "object_quaternion": worlds.object_quaternion,
             "atoms": predicted[keys.COLLISION_ATOMS],
+            "risk": predicted[keys.RISK].squeeze(-1),
+            "uncertainty": predicted[keys.UNCERTAINTY].squeeze(-1),
         }
         for name, value in values.items():
             self._tracks[name].append(value.numpy().astype(np.float32))

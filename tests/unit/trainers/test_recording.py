@@ -23,12 +23,20 @@ from tests.recordings import make_episode, make_recording
 SCENARIO = ScenarioConfig(max_obstacles=2)
 
 
-def test_risk_and_uncertainty_are_mean_and_variance_of_the_atoms() -> None:
-    """Catches a statistic of another axis, or a sample variance."""
-    recording = make_recording()
-    # 25 atoms at 0 and 25 at 1: mean 0.5, population variance 0.25 (sample variance would be 0.2551).
-    assert recording.risk == pytest.approx(np.full(7, 0.5))
-    assert recording.uncertainty == pytest.approx(np.full(7, 0.25))
+@pytest.mark.parametrize("name", ["cura-ppo", "cura-cvar", "cura-perceptual"])
+def test_risk_and_uncertainty_are_those_that_the_policy_is_charged_for(name: str) -> None:
+    """Catches mean and variance of the atoms in pictures of a method whose costs are others."""
+    (recording, _) = play(stride=2, name=name)
+    atoms = recording.atoms.astype(np.float64)
+    mean, variance = atoms.mean(1), ((atoms - atoms.mean(1, keepdims=True)) ** 2).mean(1)
+    # The largest quarter of 50 atoms: 12 and half of the next.
+    largest = -np.sort(-atoms.clip(0.0, 1.0), 1)
+    tail = (largest[:, :12].sum(1) + 0.5 * largest[:, 12]) / 12.5
+    np.testing.assert_allclose(recording.risk, tail if name == "cura-cvar" else mean, atol=1e-6)
+    if name == "cura-perceptual":
+        assert np.abs(recording.uncertainty - variance).max() > 1e-4
+    else:
+        np.testing.assert_allclose(recording.uncertainty, variance, atol=1e-6)
 
 
 def test_appearance_is_the_time_of_the_first_state_with_the_obstacle() -> None:
@@ -164,9 +172,16 @@ def worlds(step: int) -> WorldState:
     )
 
 
+def estimate(seen: TensorDict) -> TensorDict:
+    """Two atoms made of the observation."""
+    atoms = seen["observation"][:, :2]
+    moments = {"risk": atoms.mean(1, keepdim=True), "uncertainty": atoms.var(1, correction=0, keepdim=True)}
+    return seen.update({"collision_atoms": atoms, **moments})
+
+
 def test_a_recording_ends_with_its_episode_and_keeps_its_last_frame() -> None:
     """Catches rows that go on while others play, and a last state without picture."""
-    recorder = Recorder(lambda td: td.set("collision_atoms", td["observation"][:, :2]), 2, stride=3)
+    recorder = Recorder(estimate, 2, stride=3)
     over = torch.tensor([True, False])
     recorder(state(0), torch.tensor([True, True]), worlds(0))
     recorder(state(1), torch.tensor([True, True]), worlds(1))
@@ -191,17 +206,15 @@ def test_a_recording_ends_with_its_episode_and_keeps_its_last_frame() -> None:
     assert (first.maps == 128).all()
 
 
-def play(stride: int) -> list[Recording]:
+def play(stride: int, name: str = "push") -> list[Recording]:
     """Play two scenes for 1 s with the scripted pusher and an untrained estimator."""
     torch.manual_seed(0)
     task = TaskConfig(scenario=SCENARIO, stream="eval", episode_time=1.0, privileged=True)
-    config = method("push").replace(
-        perception="none", env=PushEnvConfig(task=task), map=MapConfig(extent_x=(-4.0, 4.0))
-    )
+    config = method(name).replace(perception="none", env=PushEnvConfig(task=task), map=MapConfig(extent_x=(-4.0, 4.0)))
     env = make_env(config, 2, keep_map=True, seed=0)
     try:
         scenes = choose_scenes(SCENARIO, seed=0, count=1)
-        estimator = Networks(config).collision_estimator
+        estimator = Networks(config).collision_network
         return record(env, ScriptedPusher(), estimator, scenes, label="Scripted", stride=stride)
     finally:
         env.close()
