@@ -78,7 +78,7 @@ def demo(config: DemoConfig) -> Path:
     scenes = _scenes(config, task)
     config.run_dir.mkdir(parents=True, exist_ok=True)
     with _workers(config.num_workers) as workers:
-        pairs = _play(config, task, scenes, policy_labels(loaded), workers)
+        pairs = _play(config, task, scenes, policy_labels(loaded, config.policies), workers)
         telling = most_telling(pairs, config.telling_scenes)
         cards = _draw(config, [*telling, *(pair for pair in pairs if pair not in telling)], workers)
     for line in _summary(pairs):
@@ -285,7 +285,7 @@ def _summary(pairs: Sequence[_Pair]) -> Iterator[str]:
 def _facts(config: DemoConfig, loaded: Sequence[LoadedPolicy]) -> dict[str, str]:
     machine = hardware()
     facts = {}
-    for label, policy in zip(policy_labels(loaded), loaded, strict=True):
+    for label, policy in zip(policy_labels(loaded, config.policies), loaded, strict=True):
         frames, seed, commit = (policy.record[name] for name in ("frames", "seed", "commit"))
         facts[label] = f"{frames:,} environment steps of training, seed {seed}, commit {commit}"
     facts["Scenes"] = f"evaluation stream, seed {config.seed}, up to {config.max_obstacles} obstacles, at least one"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cura_torchrl.envs.config import MapConfig, PushEnvConfig, RobotName
@@ -116,16 +117,32 @@ def method(name: str) -> TrainConfig:
     )
 
 
-def policy_labels(loaded: Sequence[LoadedPolicy]) -> list[str]:
-    """Return what policies are called in figures.
+def method_label(loaded: LoadedPolicy) -> str:
+    """Return what a policy's method is called.
+
+    Args:
+        loaded: The policy.
+
+    Returns:
+        Its name in tables, or, for a method of one's own, its name.
+    """
+    name = loaded.config.method
+    return PRESETS[name].label if name in PRESETS else name
+
+
+def policy_labels(loaded: Sequence[LoadedPolicy], sources: Sequence[str]) -> list[str]:
+    """Return what policies are called in figures and pages.
 
     Args:
         loaded: The policies.
+        sources: Where each comes from: a method's name, or the path of a run or checkpoint.
 
     Returns:
-        Their methods' names, with the steps of training where two would be the same.
+        Their methods' names; where some are the same, with the last part of the source's path or, if those are the same
+        too, all of it.
     """
-    labels = [PRESETS[policy.config.method].label for policy in loaded]
-    if len(set(labels)) == len(labels):
-        return labels
-    return [f"{label} ({policy.record['frames']:,} steps)" for label, policy in zip(labels, loaded, strict=True)]
+    labels, ends = [method_label(policy) for policy in loaded], [Path(source).name for source in sources]
+    told = sources if len(set(ends)) < len(ends) else ends
+    return [
+        label if labels.count(label) == 1 else f"{label} ({source})" for label, source in zip(labels, told, strict=True)
+    ]

@@ -85,7 +85,7 @@ class Recording:
     atoms: NDArray[np.float32]
     """The DCE's atoms of the collision possibility C, unsorted [1], shape ``[T, N]``."""
     risk: NDArray[np.float32]
-    """R that the policy is charged for: the atoms' mean, unless its method has another risk measure [1], shape ``[T]``."""
+    """R that the policy is charged for: the atoms' mean, unless its method has another one [1], shape ``[T]``."""
     uncertainty: NDArray[np.float32]
     """U that it is charged for: the atoms' variance, unless its method has another one [1], shape ``[T]``."""
     frame_steps: NDArray[np.int64]

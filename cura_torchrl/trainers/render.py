@@ -79,7 +79,7 @@ def play_scene(config: RenderConfig, loaded: Sequence[LoadedPolicy]) -> list[Rec
         def note(_: torch.Tensor) -> None:
             bar.update()
 
-        for policy, task, label in zip(loaded, tasks, policy_labels(loaded), strict=True):
+        for policy, task, label in zip(loaded, tasks, policy_labels(loaded, config.methods), strict=True):
             scene = find_scene(task.scenario, seed=config.seed, index=config.scene)
             env = policy.make_env(
                 config.chunk,

@@ -20,6 +20,7 @@ from cura_torchrl.trainers.evaluation_task import evaluation_physics, evaluation
 from cura_torchrl.trainers.folder_section import read_folder
 from cura_torchrl.trainers.loaded_policy import LoadedPolicy, load_policy
 from cura_torchrl.trainers.markup import document
+from cura_torchrl.trainers.methods import method_label, policy_labels
 from cura_torchrl.trainers.progress import read_progress
 from cura_torchrl.trainers.recording import find_scene, record
 from cura_torchrl.trainers.report_config import ReportConfig
@@ -87,7 +88,7 @@ def report(config: ReportConfig) -> Path:
         report_page.configuration_section(first.loaded.config),
     ]
     page = document(
-        title=f"{report_page.method_label(first.loaded)}: report of a trained policy",
+        title=f"{method_label(first.loaded)}: report of a trained policy",
         introduction=report_page.introduction(sections),
         main="\n".join(section.html for section in sections),
         facts=report_page.provenance_facts(),
@@ -105,13 +106,9 @@ def _load_runs(config: ReportConfig) -> list[Run]:
         if baseline.path not in [policy.path for policy in loaded]:
             sources.append(config.baseline)
             loaded.append(baseline)
-    names = [report_page.method_label(policy) for policy in loaded]
-    labels = [
-        name if names.count(name) == 1 else f"{name} ({source})" for name, source in zip(names, sources, strict=True)
-    ]
     return [
         Run(source=source, label=label, loaded=policy, rows=read_progress(progress_path(policy.path)))
-        for source, label, policy in zip(sources, labels, loaded, strict=True)
+        for source, label, policy in zip(sources, policy_labels(loaded, sources), loaded, strict=True)
     ]
 
 

@@ -13,7 +13,7 @@ from cura_torchrl.trainers.configuration_tree import configuration_tree, count_d
 from cura_torchrl.trainers.curves import columns_by_group, curves_figure, label_of, smooth
 from cura_torchrl.trainers.folder_section import Folder, folder_html
 from cura_torchrl.trainers.info import provenance
-from cura_torchrl.trainers.methods import PRESETS, method
+from cura_torchrl.trainers.methods import PRESETS, method, method_label
 from cura_torchrl.trainers.page import HOW_TO_READ, Card, scene_article
 
 if TYPE_CHECKING:
@@ -58,19 +58,6 @@ class Section:
     def html(self) -> str:
         """The section with its heading."""
         return f'<section id="{self.name}"><h2>{escape(self.title)}</h2>{self.body}</section>'
-
-
-def method_label(loaded: LoadedPolicy) -> str:
-    """Return what a policy's method is called.
-
-    Args:
-        loaded: The policy.
-
-    Returns:
-        Its name in tables, or, for a method of one's own, its name.
-    """
-    name = loaded.config.method
-    return PRESETS[name].label if name in PRESETS else name
 
 
 def introduction(sections: Sequence[Section]) -> str:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 
-from cura_torchrl.trainers.methods import EXTENSIONS, METHODS, PRESETS, method
+from cura_torchrl.trainers.config import TrainConfig
+from cura_torchrl.trainers.methods import EXTENSIONS, METHODS, PRESETS, method, policy_labels
 
 # Paper, section "Experimental Results": (name there, object hides what is behind it, alpha, lambda_r, lambda_u, robot);
 # alpha = 1 is a map without confidence.
@@ -92,3 +94,23 @@ def test_an_unknown_name_is_refused_with_the_names_there_are() -> None:
         ValueError, match=r"method is 'cura_ppo' \(did you mean cura-ppo\?\); accepted: cura-ppo, push, "
     ):
         method("cura_ppo")
+
+
+@pytest.mark.parametrize(
+    ("sources", "labels"),
+    [
+        (("cura-ppo", "push"), ["CURA-PPO", "Push w/ Occlusion"]),
+        (("runs/cura-ppo-0", "runs/cura-ppo-1"), ["CURA-PPO (cura-ppo-0)", "CURA-PPO (cura-ppo-1)"]),
+        (("a/cura-ppo", "b/cura-ppo"), ["CURA-PPO (a/cura-ppo)", "CURA-PPO (b/cura-ppo)"]),
+        (
+            ("runs/cura-ppo-0", "push", "cura-ppo"),
+            ["CURA-PPO (cura-ppo-0)", "Push w/ Occlusion", "CURA-PPO (cura-ppo)"],
+        ),
+        (("runs/of-ones-own", "push"), ["of-ones-own", "Push w/ Occlusion"]),
+    ],
+)
+def test_no_two_policies_are_called_the_same(sources: tuple[str, ...], labels: list[str]) -> None:
+    """Catches two training seeds under one title, and a method of one's own that has no picture."""
+    names = ["push" if "push" in source else "of-ones-own" if "own" in source else "cura-ppo" for source in sources]
+    loaded = [SimpleNamespace(config=TrainConfig(method=name), record={"frames": 8}) for name in names]
+    assert policy_labels(loaded, sources) == labels
