@@ -107,6 +107,12 @@ class Result:
     """Lower bound of its 95 % bootstrap interval [1]."""
     share_high: float
     """Upper bound of it [1]."""
+    collision_share: float
+    """Share of the collisions added by occlusion that is avoided [1]."""
+    collision_share_low: float
+    """Lower bound of its 95 % bootstrap interval [1]."""
+    collision_share_high: float
+    """Upper bound of it [1]."""
 
 
 def compare(played: Played) -> list[Result]:
@@ -133,7 +139,6 @@ def _result(played: Played, method: str, name: str, group: list[str]) -> Result:
     hits = {f"hit_{name}": number / count for name, number in counts["collisions_by"].items()}
     iqm, low, high = _interval([_trials(played[method][cell]) for cell in group])
     difference, p = _difference(played, method, group)
-    share = _share(played, method, group)
     return Result(
         method=method,
         cell=name,
@@ -152,10 +157,16 @@ def _result(played: Played, method: str, name: str, group: list[str]) -> Result:
         tipped=counts["tipped"] / count,
         steps=counts["mean_steps"],
         **_measures([episode.measures for episode in episodes if episode.measures is not None]),
-        **dict(zip(("difference", "difference_low", "difference_high"), difference, strict=True)),
+        **_bounded("difference", difference),
         mcnemar_p=p,
-        **dict(zip(("share", "share_low", "share_high"), share, strict=True)),
+        **_bounded("share", _share(played, method, group, _succeeds)),
+        **_bounded("collision_share", _share(played, method, group, _avoids)),
     )
+
+
+def _bounded(name: str, numbers: tuple[float, float, float]) -> dict[str, float]:
+    """Return a number and its bounds by the names of the result's fields."""
+    return dict(zip((name, f"{name}_low", f"{name}_high"), numbers, strict=True))
 
 
 def _measures(found: list[Measures]) -> dict[str, float]:
@@ -178,9 +189,17 @@ def _measures(found: list[Measures]) -> dict[str, float]:
     }
 
 
-def _trials(runs: Sequence[Sequence[Episode]]) -> NDArray[np.bool_]:
-    """Return the successes, shape ``[S, M]``: S training seeds, M scenes."""
-    return np.array([[episode.success[0] for episode in run] for run in runs], dtype=bool)
+def _succeeds(episode: Episode) -> bool:
+    return episode.success[0]
+
+
+def _avoids(episode: Episode) -> bool:
+    return not episode.collision
+
+
+def _trials(runs: Sequence[Sequence[Episode]], holds: Callable[[Episode], bool] = _succeeds) -> NDArray[np.bool_]:
+    """Return what holds of the scenes, shape ``[S, M]``: S training seeds, M scenes."""
+    return np.array([[holds(episode) for episode in run] for run in runs], dtype=bool)
 
 
 def _interval(trials: list[NDArray[np.bool_]]) -> tuple[float, float, float]:
@@ -209,8 +228,10 @@ def _difference(played: Played, method: str, group: list[str]) -> tuple[tuple[fl
     return (float(middle), float(low), float(high)), math.nan
 
 
-def _share(played: Played, method: str, group: list[str]) -> tuple[float, float, float]:
+def _share(
+    played: Played, method: str, group: list[str], holds: Callable[[Episode], bool]
+) -> tuple[float, float, float]:
     needed = (UNOCCLUDED, BASELINE)
     if method in needed or not set(needed) <= set(played):
         return _NAN
-    return share_recovered([[_trials(played[who][cell]) for who in (*needed, method)] for cell in group])
+    return share_recovered([[_trials(played[who][cell], holds) for who in (*needed, method)] for cell in group])

@@ -203,6 +203,8 @@ def test_pairs_and_share_are_those_worked_out_by_hand() -> None:
     assert (cura.success, cura.collisions, cura.hit_arm, cura.hit_base, cura.timeouts) == (0.5, 0.25, 0.25, 0.0, 0.25)
     assert (cura.difference, cura.mcnemar_p) == pytest.approx((0.3, 0.109375))
     assert cura.share == pytest.approx(0.5)
+    # Without occlusion there is no collision, with it there are 16, and cura-ppo has 5: 11 of 16 are avoided.
+    assert cura.collision_share == pytest.approx(11 / 16)
     assert cura.share_low < 0.5 < cura.share_high
     # Wilson for 10 of 20, z^2 = 3.841459: half width 1.959964 sqrt(0.0125 + 0.0024009) / 1.192073 = 0.200703
     assert (cura.low, cura.high) == pytest.approx((0.299298, 0.700702), abs=1e-5)
