@@ -150,9 +150,9 @@ def test_all_are_evaluated_on_the_same_task_whatever_they_were_trained_on(tmp_pa
     config = preset.replace(env=env)
     save_checkpoint({"networks": Networks(config)}, config, tmp_path, frames=1)
     with closing(Player(EvaluateConfig(checkpoint=tmp_path, simulator="planar", chunk=1))) as player:
-        played = player._env.base_env.config
+        played = player._env.config
     with closing(Player(EvaluateConfig(policy="scripted", simulator="planar", chunk=1))) as player:
-        paired = player._env.base_env.config
+        paired = player._env.config
     assert played.task == paired.task
     assert played.physics == dataclasses.replace(paired.physics, planar_graph=True)
     assert (played.robot, played.lidar) == (robot, preset.env.lidar)

@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import io
 import math
+import os
 import signal
 import sqlite3
 import subprocess
@@ -123,11 +124,26 @@ def test_a_run_that_was_broken_off_ends_with_the_same_table(tmp_path: Path, monk
         assert (tmp_path / "broken" / name).read_text() == (tmp_path / "whole" / name).read_text()
 
 
-def test_a_run_that_was_killed_goes_on_and_ends_with_the_same_file(tmp_path: Path) -> None:
+def shorten_episodes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the processes that are started, and theirs, play episodes of one second."""
+    patch = """import functools
+from cura_torchrl.envs.config import TaskConfig
+from cura_torchrl.trainers import evaluation_task
+evaluation_task.TaskConfig = functools.partial(TaskConfig, episode_time=1.0)
+"""
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(patch, encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), *sys.path]))
+
+
+def test_a_run_that_was_killed_goes_on_and_ends_with_the_same_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a file that SIGKILL leaves half written, and processes that play on without a parent."""
     untrained(tmp_path, "push", 0)
+    shorten_episodes(tmp_path / "start", monkeypatch)
     flags = ["--methods", "push", "--cells", ",".join(CELLS), "--seeds", "0", "--runs", str(tmp_path)]
-    options = [*flags, "--episodes", "8", "--chunk", "2", "--simulator", "planar", "--num-workers", "2"]
+    options = [*flags, "--episodes", "24", "--chunk", "2", "--simulator", "planar", "--num-workers", "2"]
     command = [sys.executable, "-m", "cura_torchrl.trainers.cli", "table", *options, "--out"]
     killed, whole = tmp_path / "killed" / STORE_NAME, tmp_path / "whole" / STORE_NAME
     with subprocess.Popen(
@@ -139,7 +155,7 @@ def test_a_run_that_was_killed_goes_on_and_ends_with_the_same_file(tmp_path: Pat
         process.send_signal(signal.SIGKILL)
         # The pipe closes when the last of those that hold it has ended: the workers too.
         process.communicate(timeout=60)
-    assert 0 < len(rows_of(killed)) < 16
+    assert 0 < len(rows_of(killed)) < 48
     assert len(rows_of(killed)) % 2 == 0
     pages = [
         subprocess.run([*command, str(path.parent)], capture_output=True, text=True, check=True).stdout
