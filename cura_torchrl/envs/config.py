@@ -303,6 +303,11 @@ class MapConfig:
         size = (self.resolution, self.window)
         require(min(size) > 0, "resolution, window", size, "positive numbers")
 
+    @property
+    def num_channels(self) -> int:
+        """Channels of the window."""
+        return 2 if self.channels == "confidence+occupancy" else 1
+
 
 @dataclass(frozen=True, kw_only=True)
 class PhysicsConfig:

@@ -240,7 +240,7 @@ def fitting_encoder(config: TrainConfig) -> MapVAE:
     """  # noqa: DOC502 - raised by what this calls
     encoder = load_encoder(config.encoder)
     channels, window = (encoder.shape[name] for name in ("channels", "window"))
-    expected = 2 if config.map.channels == "confidence+occupancy" else 1
+    expected = config.map.num_channels
     if (channels, window) != (expected, config.map.window):
         given = f"map.channels is {config.map.channels!r} and map.window {config.map.window}"
         takes = f"{channels} x {window} x {window} that the encoder {config.encoder or SHIPPED_ENCODER} takes"

@@ -115,7 +115,7 @@ def verify(path: Path) -> None:
         msg = f"checkpoint {path} is damaged: {name} {state}; accepted: a checkpoint as it was written"
         raise CheckpointError(msg)
     for name, digest in expected.items():
-        if (path / name).is_symlink() or _sha256(path / name) != digest:
+        if (path / name).is_symlink() or file_sha256(path / name) != digest:
             msg = f"checkpoint {path} is damaged: {name} has changed; accepted: a checkpoint as it was written"
             raise CheckpointError(msg)
 
@@ -197,7 +197,7 @@ def weights_sha256(path: Path) -> str:
     Returns:
         SHA-256 of the checkpoint's list of hashes.
     """
-    return _sha256(path / SUMS_NAME)
+    return file_sha256(path / SUMS_NAME)
 
 
 def progress_path(checkpoint: Path) -> Path:
@@ -238,7 +238,7 @@ def _fill(stage: Path, components: Mapping[str, Any], config: TrainConfig, facts
     record = {"config": config.to_json(), "seed": config.seed, **facts}
     (stage / CONFIG_NAME).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     files = sorted(entry for entry in stage.rglob("*") if entry.is_file())
-    lines = [f"{_sha256(file)}  {file.relative_to(stage).as_posix()}\n" for file in files]
+    lines = [f"{file_sha256(file)}  {file.relative_to(stage).as_posix()}\n" for file in files]
     (stage / SUMS_NAME).write_text("".join(lines), encoding="utf-8")
 
 
@@ -264,7 +264,15 @@ def _flush(path: Path) -> None:
         os.close(handle)
 
 
-def _sha256(path: Path) -> str:
+def file_sha256(path: Path) -> str:
+    """Return a file's SHA-256.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Hash in hexadecimal digits.
+    """
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

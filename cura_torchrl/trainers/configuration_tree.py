@@ -11,7 +11,7 @@ from html import escape
 from typing import Any
 
 from cura_torchrl.trainers import markup
-from cura_torchrl.trainers.decoding import encode
+from cura_torchrl.trainers.decoding import changed_fields, encode
 
 
 def field_docstrings(cls: type[Any]) -> dict[str, str]:
@@ -56,11 +56,7 @@ def count_differences(config: Any, other: Any) -> int:
         >>> count_differences(TrainConfig(cura=CURAConfig(gamma=0.5), seed=1), TrainConfig())
         2
     """
-    pairs = [(getattr(config, item.name), getattr(other, item.name)) for item in dataclasses.fields(config)]
-    return sum(
-        count_differences(one, two) if dataclasses.is_dataclass(one) and type(one) is type(two) else one != two
-        for one, two in pairs
-    )
+    return len(changed_fields(config, other))
 
 
 def configuration_tree(config: Any, preset: Any) -> str:

@@ -7,7 +7,6 @@ compared with PyTorch on recorded observations before it appears, and holds that
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import importlib.util
 import json
@@ -28,6 +27,7 @@ from tqdm import tqdm
 from cura_torchrl import keys
 from cura_torchrl.envs.transforms import ConfidenceMap
 from cura_torchrl.trainers.build import load_encoder
+from cura_torchrl.trainers.checkpoint import file_sha256
 from cura_torchrl.trainers.errors import CheckpointError, RunError, UnavailableError
 from cura_torchrl.trainers.export_description import Signal, describe, map_signals, policy_signals
 from cura_torchrl.trainers.loaded_policy import LoadedPolicy, load_policy
@@ -270,7 +270,7 @@ def _describe(stage: Path, loaded: LoadedPolicy, transform: ConfidenceMap) -> No
         raise RunError(msg)
     description["largest_difference_from_pytorch"] = found
     files = sorted(file for file in stage.iterdir() if file != path)
-    description["sha256"] = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    description["sha256"] = {file.name: file_sha256(file) for file in files}
     path.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 
 from cura_torchrl.trainers.build import SHIPPED_ENCODER, Networks, make_env
 from cura_torchrl.trainers.checkpoint import (
+    file_sha256,
     find_checkpoint,
     progress_path,
     read_config,
@@ -180,7 +180,7 @@ def _require_shipped_encoder(config: TrainConfig) -> None:
     if not path.is_file():
         msg = f"encoder is {path}, which is not there to compare; {accepted}"
         raise UnavailableError(msg)
-    ours, theirs = (hashlib.sha256(file.read_bytes()).hexdigest() for file in (path, SHIPPED_ENCODER))
+    ours, theirs = file_sha256(path), file_sha256(SHIPPED_ENCODER)
     if ours != theirs:
         msg = f"encoder is {path}, SHA-256 {ours[:12]}; {accepted}, SHA-256 {theirs[:12]}"
         raise UnavailableError(msg)

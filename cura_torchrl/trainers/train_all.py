@@ -15,7 +15,7 @@ from collections import Counter, deque
 from typing import TYPE_CHECKING, Any
 
 from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, weights_sha256
-from cura_torchrl.trainers.decoding import encode
+from cura_torchrl.trainers.decoding import changed_fields, encode
 from cura_torchrl.trainers.errors import CheckpointError, Interrupted
 from cura_torchrl.trainers.info import hardware
 from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER, is_locked
@@ -257,10 +257,10 @@ def _require_same(run: PlannedRun, starts: Mapping[Path, str]) -> None:
         return
     before, _ = read_config(source)
     free = {*MACHINE_FIELDS, "total_frames", "run_dir"}
-    then, now = dict(_flat(encode(before))), dict(_flat(encode(run.config)))
-    changed = [name for name in now if name not in free and then[name] != now[name]]
+    fields = changed_fields(before, run.config)
+    changed = [f"{name} {then}, not {now}" for name, (then, now) in fields.items() if name not in free]
     if changed:
-        shown = ", ".join(f"{name} {then[name]}, not {now[name]}" for name in changed[:3])
+        shown = ", ".join(changed[:3])
         more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
         msg = f"{folder} was trained with {shown}{more}; accepted: its own configuration, or another --runs"
         raise CheckpointError(msg)

@@ -139,7 +139,7 @@ class ConfidenceMap(Transform):
     @property
     def num_channels(self) -> int:
         """Channels of the window."""
-        return 2 if self.config.channels == "confidence+occupancy" else 1
+        return self.config.num_channels
 
     def initial_state(self, num_rows: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the maps of the start of an episode, in which nothing has been seen.
