@@ -21,7 +21,7 @@ from cura_torchrl.trainers.calibration_figures import coverage_figure, reliabili
 from cura_torchrl.trainers.calibration_report import as_markdown
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.evaluate import play_episodes
-from cura_torchrl.trainers.futures import against_truth, horizon, summarise
+from cura_torchrl.trainers.futures import against_truth, exploration, horizon, summarise
 from cura_torchrl.trainers.info import provenance
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.statistics import bootstrap_interval
@@ -178,8 +178,15 @@ def _observe(
             track.watch(state, playing)
             meter.watch(state, playing & ~state[keys.SUCCESS][:, 0])
 
-        episodes = torch.arange(config.episodes)
-        played = play_episodes(env, loaded.policy, episodes, watch=watch, report=lambda _: report())
+        torch.manual_seed(config.seed)
+        played = play_episodes(
+            env,
+            loaded.policy,
+            torch.arange(config.episodes),
+            watch=watch,
+            report=lambda _: report(),
+            exploration=exploration(config),
+        )
     return {
         "successes": sum(episode.success[0] for episode in played),
         "collisions": sum(episode.collision for episode in played),

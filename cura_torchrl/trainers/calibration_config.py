@@ -38,7 +38,8 @@ class CalibrateConfig:
     repeats: int = 4
     """Futures that share hidden obstacles and differ in what is still to come [1]; a divisor of the futures."""
     actions: Literal["mean", "drawn"] = "mean"
-    """Whether the policy takes its mean action in the futures, as in evaluation, or draws it, as in training."""
+    """Whether the policy takes its mean action, as in evaluation, or draws it, as in training; drawn actions are those
+    that the estimator was trained on."""
     candidates: int = 8192
     """Draws from the prior among which those are kept that agree with what was seen [1]."""
     simulator: Simulator = "planar"

@@ -111,7 +111,10 @@ def _curves_figure(
         axis.set_xlabel(labels[0])
     _look_closer(axes[0], seen, near_zero=near_zero)
     axes[0].set_ylabel(labels[1])
-    axes[0].legend(fontsize=8, loc="upper left")
+    # A method may have points in some panels only, or in none.
+    drawn = {label: line for axis in axes for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    if drawn:
+        axes[0].legend(drawn.values(), drawn.keys(), fontsize=8, loc="upper left")
     return encode(figure, "png")
 
 

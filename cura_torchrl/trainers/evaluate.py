@@ -184,8 +184,9 @@ def play_episodes(
     report: Callable[[Episode], object] = _ignore,
     watch: Callable[[TensorDictBase, torch.Tensor], object] = _ignore,
     meter: EpisodeMeter | None = None,
+    exploration: ExplorationType = ExplorationType.DETERMINISTIC,
 ) -> list[Episode]:
-    """Play scenarios, each once, with the policy's mean action.
+    """Play scenarios, each once, with the policy's mean action unless said otherwise.
 
     A world whose episode is over takes the next scenario that waits; where none does it stands still, so that the
     policy's batch keeps its size, on which the last bits of its actions depend.
@@ -198,6 +199,7 @@ def play_episodes(
         watch: Called with what the environment emits at the start and after every step, batch size ``[N]``, and with
             the rows that were being played until then, bool, shape ``[N]``.
         meter: Measures the episodes; it needs an environment with ``TaskConfig.privileged``.
+        exploration: How the policy's distribution becomes an action.
 
     Returns:
         How they were played, in the order of ``indices``.
@@ -208,7 +210,7 @@ def play_episodes(
     reached = torch.zeros(num_worlds, dtype=torch.int64)
     outcomes: dict[int, Episode] = {}
     measure = _ignore if meter is None else meter.watch
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with set_exploration_type(exploration):
         state = env.reset(episodes=indices[playing.clamp_min(0)])
         watch(state, playing >= 0)
         measure(state, playing >= 0)

@@ -64,6 +64,18 @@ def horizon(gamma: float, tail: float = TAIL) -> int:
     return math.ceil(math.log(tail) / math.log(gamma))
 
 
+def exploration(config: CalibrateConfig) -> ExplorationType:
+    """Return how the policy's distribution becomes an action.
+
+    Args:
+        config: Says whether actions are drawn.
+
+    Returns:
+        TorchRL's exploration type.
+    """
+    return ExplorationType.RANDOM if config.actions == "drawn" else ExplorationType.DETERMINISTIC
+
+
 class _Source:
     """The worlds in which states are reached, with what has happened in them.
 
@@ -177,8 +189,9 @@ def against_truth(
     with (
         closing(loaded.make_env(worlds, seed=config.seed, **options)) as first,
         closing(loaded.make_env(rows, seed=config.seed, **options)) as target,
-        set_exploration_type(ExplorationType.DETERMINISTIC),
+        set_exploration_type(exploration(config)),
     ):
+        torch.manual_seed(config.seed)
         target.rand_step(target.reset())
         source = _Source(first)
         while len(notes["episode"]) < config.states:
@@ -231,10 +244,8 @@ def _look_ahead(
     put_obstacles(target, spread.pose, spread.edge, spread.adversarial)
     vary(target, torch.arange(config.futures) + (config.seed * 100_000 + number) * config.futures)
     state = source.state[row : row + 1]
-    drawn = ExplorationType.RANDOM if config.actions == "drawn" else ExplorationType.DETERMINISTIC
-    with set_exploration_type(drawn):
-        start = state.expand(config.futures).clone()
-        came_out = roll(target, loaded.policy, start, gamma=gamma, steps=horizon(gamma))
+    start = state.expand(config.futures).clone()
+    came_out = roll(target, loaded.policy, start, gamma=gamma, steps=horizon(gamma))
     mean, variance = (float(value) for value in _predict(loaded, state))
     return {
         "predicted_mean": mean,

@@ -13,8 +13,9 @@ import torch
 from PIL import Image
 from tensordict import TensorDict
 
-from cura_torchrl.trainers.calibrate import _LOOKING, Track, _write, looking
+from cura_torchrl.trainers.calibrate import _LOOKING, Track, _write, calibrate, looking
 from cura_torchrl.trainers.calibration import LEVELS, PROBABILITY_EDGES, Predictions, measure
+from cura_torchrl.trainers.calibration_config import CalibrateConfig
 from cura_torchrl.trainers.calibration_figures import coverage_figure, reliability_figure, truth_figure
 from cura_torchrl.trainers.calibration_report import as_markdown
 from cura_torchrl.trainers.futures import decompose, summarise
@@ -157,3 +158,19 @@ def test_what_is_written_is_strict_json_with_every_state(tmp_path: Path):
     for name in ("reliability", "coverage", "truth"):
         with Image.open(tmp_path / f"{name}.png") as picture:
             assert picture.width > 300
+
+
+def test_drawn_actions_are_played_and_looked_ahead_with_and_come_again(tmp_path: Path):
+    """Catches states or futures of mean actions where drawn ones were asked for, and draws that change between runs."""
+    found = []
+    for number, actions in enumerate(("mean", "drawn", "drawn")):
+        config = CalibrateConfig(
+            methods=("cura-ppo",), conditions=("adversarial",), episodes=2, chunk=2, states=1, futures=4, repeats=2,
+            candidates=1000, actions=actions, out=tmp_path / str(number),
+        )  # fmt: skip
+        calibrate(config)
+        page = json.loads((config.out / "calibration.json").read_text(encoding="utf-8"))
+        looking, truth = page["methods"]["cura-ppo"]["adversarial"]["looking"], page["truth_states"]["cura-ppo"]
+        found.append((looking["beside_m"], truth["predicted_mean"]))
+    assert found[1] == found[2]
+    assert all(mean != drawn for mean, drawn in zip(*found[:2], strict=True))
