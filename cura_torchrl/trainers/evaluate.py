@@ -20,7 +20,7 @@ from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.envs.robots import scripted
 from cura_torchrl.trainers.config import EvaluateConfig
 from cura_torchrl.trainers.episode_measures import EpisodeMeter, Measures
-from cura_torchrl.trainers.evaluation_task import evaluation_physics, evaluation_task
+from cura_torchrl.trainers.evaluation_task import evaluation_task
 from cura_torchrl.trainers.info import git_commit, versions
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.statistics import wilson_interval
@@ -324,15 +324,7 @@ def _build(config: EvaluateConfig) -> tuple[EnvBase, Callable[[TensorDictBase], 
     """Return the worlds and who plays in them."""
     if config.policy is None:
         loaded = load_policy(_path(config))
-        trained = loaded.config.env
-        env = loaded.make_env(
-            config.chunk,
-            task=evaluation_task(trained.task, config),
-            physics=evaluation_physics(trained),
-            simulator=config.simulator,
-            seed=config.seed,
-        )
-        return env, loaded.policy
+        return loaded.make_evaluation_env(config.chunk, config, simulator=config.simulator), loaded.policy
     base = PushEnvConfig(simulator=config.simulator, robot=RobotConfig(model=config.robot))
     env = PushEnv(config.chunk, dataclasses.replace(base, task=evaluation_task(base.task, config)), seed=config.seed)
     if config.policy == "random":

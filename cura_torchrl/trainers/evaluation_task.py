@@ -28,6 +28,11 @@ class SceneChoice(Protocol):
         """Most obstacles K in an episode [1]."""
         ...
 
+    @property
+    def seed(self) -> int:
+        """Seed of the scenes [1]."""
+        ...
+
 
 def evaluation_task(task: TaskConfig, config: SceneChoice) -> TaskConfig:
     """Return the task that is evaluated, and the true obstacles in what is emitted.

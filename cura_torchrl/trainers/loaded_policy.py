@@ -24,6 +24,7 @@ from cura_torchrl.trainers.checkpoint import (
 )
 from cura_torchrl.trainers.config import TrainConfig
 from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
+from cura_torchrl.trainers.evaluation_task import evaluation_physics, evaluation_task
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.methods import PRESETS
 from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
     from cura_torchrl.envs.config import PhysicsConfig, Simulator, TaskConfig
+    from cura_torchrl.trainers.evaluation_task import SceneChoice
 
 SHIPPED_FOLDER = Path(__file__).parent / "weights"
 """Folder of the weights that come with the package, one folder a method."""
@@ -89,6 +91,30 @@ class LoadedPolicy:
         env = dataclasses.replace(trained, task=played, physics=physics or trained.physics, simulator=where)
         config = self.config.replace(env=env, simulator=where)
         return make_env(config, num_envs, keep_map=keep_map, **options)
+
+    def make_evaluation_env(
+        self, num_envs: int, scenes: SceneChoice, *, simulator: Simulator | None = None, keep_map: bool = False
+    ) -> EnvBase:
+        """Return the environment in which all policies are evaluated, with this one's robot, sensors and clock.
+
+        Args:
+            num_envs: Number of worlds N.
+            scenes: Which scenes.
+            simulator: Where to play; None is where the policy was trained.
+            keep_map: Whether the window of the map stays in the tensordict under ``confidence_map``.
+
+        Returns:
+            The environment with its transforms, and the true obstacles in what it emits.
+        """
+        trained = self.config.env
+        return self.make_env(
+            num_envs,
+            task=evaluation_task(trained.task, scenes),
+            physics=evaluation_physics(trained),
+            simulator=simulator,
+            keep_map=keep_map,
+            seed=scenes.seed,
+        )
 
 
 def load_policy(source: str | Path) -> LoadedPolicy:

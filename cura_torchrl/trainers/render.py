@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from cura_torchrl.trainers.animation import animation_frames, frame_numbers
 from cura_torchrl.trainers.estimate_figures import appearance_figure, distribution_figure
-from cura_torchrl.trainers.evaluation_task import evaluation_physics, evaluation_task
+from cura_torchrl.trainers.evaluation_task import evaluation_task
 from cura_torchrl.trainers.figures import layout_figure, paths_figure, snapshots_figure
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.methods import policy_labels
@@ -81,14 +81,7 @@ def play_scene(config: RenderConfig, loaded: Sequence[LoadedPolicy]) -> list[Rec
 
         for policy, task, label in zip(loaded, tasks, policy_labels(loaded, config.methods), strict=True):
             scene = find_scene(task.scenario, seed=config.seed, index=config.scene)
-            env = policy.make_env(
-                config.chunk,
-                task=task,
-                physics=evaluation_physics(policy.config.env),
-                simulator=config.simulator,
-                keep_map=True,
-                seed=config.seed,
-            )
+            env = policy.make_evaluation_env(config.chunk, config, simulator=config.simulator, keep_map=True)
             with one_thread(), closing(env):
                 recordings += record(
                     env, policy.policy, policy.collision_estimator, [scene], label=label, stride=1, watch=note

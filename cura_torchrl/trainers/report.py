@@ -16,7 +16,7 @@ from cura_torchrl.trainers.checkpoint import progress_path
 from cura_torchrl.trainers.demo import draw_card
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.estimate_figures import distribution_figure
-from cura_torchrl.trainers.evaluation_task import evaluation_physics, evaluation_task
+from cura_torchrl.trainers.evaluation_task import evaluation_task
 from cura_torchrl.trainers.folder_section import read_folder
 from cura_torchrl.trainers.loaded_policy import LoadedPolicy, load_policy
 from cura_torchrl.trainers.markup import document
@@ -151,16 +151,7 @@ def _play(config: ReportConfig, players: list[Run]) -> tuple[Recording, ...]:
 
 def _play_one(config: ReportConfig, player: Run, scene: Scene, bar: tqdm) -> Recording:
     loaded = player.loaded
-    trained = loaded.config.env
-    env = loaded.make_env(
-        1,
-        task=evaluation_task(trained.task, config),
-        physics=evaluation_physics(trained),
-        simulator=config.simulator,
-        keep_map=True,
-        seed=config.seed,
-    )
-    with closing(env):
+    with closing(loaded.make_evaluation_env(1, config, simulator=config.simulator, keep_map=True)) as env:
         (recording,) = record(
             env,
             loaded.policy,

@@ -18,7 +18,7 @@ from cura_torchrl.trainers import raster
 from cura_torchrl.trainers.animation import map_image
 from cura_torchrl.trainers.errors import UnavailableError
 from cura_torchrl.trainers.evaluate import play_episodes
-from cura_torchrl.trainers.evaluation_task import evaluation_physics, evaluation_task
+from cura_torchrl.trainers.evaluation_task import evaluation_task
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.recording import Recorder, Recording, find_scene, record
 from cura_torchrl.trainers.threads import one_thread
@@ -185,15 +185,7 @@ def play_scene(config: ViewConfig, loaded: LoadedPolicy, shown: View) -> None:
     task = evaluation_task(loaded.config.env.task, config)
     index = int(shown.scene_index.value)
     scene = find_scene(task.scenario, seed=config.seed, index=index)
-    env = loaded.make_env(
-        1,
-        task=task,
-        physics=evaluation_physics(loaded.config.env),
-        simulator=config.simulator,
-        keep_map=True,
-        seed=config.seed,
-    )
-    with closing(env):
+    with closing(loaded.make_evaluation_env(1, config, simulator=config.simulator, keep_map=True)) as env:
         try:
             if config.recorded:
                 _show_recorded(loaded, env, scene, shown)

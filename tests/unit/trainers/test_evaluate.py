@@ -24,11 +24,14 @@ from cura_torchrl.trainers.build import Networks, make_env
 from cura_torchrl.trainers.checkpoint import read_config, save_checkpoint
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.evaluate import Episode, Player, evaluate, play_episodes, summarise
+from cura_torchrl.trainers.evaluation_task import evaluation_physics, evaluation_task
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.loaded_policy import SHIPPED_FOLDER
 from cura_torchrl.trainers.methods import method
+from tests.runs import short_evaluation
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 REQUIRED = {
@@ -133,8 +136,8 @@ def test_shipped_weights_are_evaluated_on_what_they_were_trained_on(name: str) -
     played = {"stream": "eval", "random_first_age": False, "curriculum": (), "privileged": True}
     choice = EvaluateConfig(method=name, scenario="adversarial", object_size=0.75, max_obstacles=3)
     expected = dataclasses.replace(trained.task, scenario=scenario, **played)
-    assert module.evaluation_task(trained.task, choice) == expected
-    assert module.evaluation_physics(trained) == trained.physics
+    assert evaluation_task(trained.task, choice) == expected
+    assert evaluation_physics(trained) == trained.physics
 
 
 def test_all_are_evaluated_on_the_same_task_whatever_they_were_trained_on(tmp_path: Path) -> None:
@@ -162,19 +165,17 @@ def test_a_policy_that_acts_at_another_rate_keeps_it() -> None:
     """Catches actions that are held for longer or shorter than in training, and a clock that does not divide it."""
     physics = PhysicsConfig(control_period=0.01, planar_period=0.025, gravity=1.0)
     trained = PushEnvConfig(task=TaskConfig(policy_period=0.25), physics=physics)
-    task = module.evaluation_task(trained.task, EvaluateConfig(policy="random"))
+    task = evaluation_task(trained.task, EvaluateConfig(policy="random"))
     assert task.policy_period == 0.25
     clock = PhysicsConfig(control_period=0.01, planar_period=0.025)
-    assert PushEnvConfig(task=task, physics=module.evaluation_physics(trained)).physics == clock
+    assert PushEnvConfig(task=task, physics=evaluation_physics(trained)).physics == clock
 
 
 @pytest.fixture
-def short_task(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_task() -> Iterator[None]:
     """Episodes of 1 s, so that an evaluation is over at once."""
-    build = module.evaluation_task
-    monkeypatch.setattr(
-        module, "evaluation_task", lambda task, config: dataclasses.replace(build(task, config), episode_time=1.0)
-    )
+    with short_evaluation():
+        yield
 
 
 @pytest.mark.usefixtures("short_task")
