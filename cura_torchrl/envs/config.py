@@ -9,12 +9,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 ScenarioKind = Literal["uniform", "adversarial", "mixed"]
 Stream = Literal["train", "eval", "vae"]
 Simulator = Literal["bullet", "planar"]
 RobotName = Literal["ridgeback_franka", "ridgeback"]
+
+STREAMS: tuple[Stream, ...] = get_args(Stream)
+"""Streams of scenarios; the number of each keys its draws."""
 
 
 def require(condition: bool, what: str, value: object, accepted: str) -> None:
@@ -201,6 +204,29 @@ class TaskConfig:
         frames = [step[0] for step in self.curriculum]
         require(frames == sorted(frames), "curriculum", self.curriculum, "steps in increasing frames")
         require(all(0 <= step[1] <= 6 for step in self.curriculum), "curriculum", self.curriculum, "0 to 6 obstacles")
+
+    @property
+    def max_steps(self) -> int:
+        """Time limit of an episode in policy steps [1]."""
+        return round(self.episode_time / self.policy_period)
+
+    def max_obstacles(self, frames: int) -> int:
+        """Return K, the most obstacles of an episode that starts now.
+
+        Args:
+            frames: Environment steps so far [1].
+
+        Returns:
+            Number of obstacles [1].
+
+        Examples:
+            >>> TaskConfig(curriculum=((0, 0), (1000, 2))).max_obstacles(999)
+            0
+        """
+        if not self.curriculum:
+            return self.scenario.max_obstacles
+        reached = [most for start, most in self.curriculum if start <= frames]
+        return reached[-1] if reached else 0
 
 
 @dataclass(frozen=True, kw_only=True)

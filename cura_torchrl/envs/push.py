@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from cura_torchrl import keys
 from cura_torchrl.envs import geometry
-from cura_torchrl.envs.config import PushEnvConfig
+from cura_torchrl.envs.config import STREAMS, PushEnvConfig
 from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.inputs import checked_action, checked_episodes
 from cura_torchrl.envs.mdp.observations import observation_size, observe
@@ -168,11 +168,7 @@ class PushEnv(EnvBase):
     @property
     def max_obstacles(self) -> int:
         """Most obstacles K in an episode that starts now."""
-        curriculum = self.config.task.curriculum
-        reached = [most for frames, most in curriculum if frames <= self.frames_done]
-        if not curriculum:
-            return self.config.task.scenario.max_obstacles
-        return reached[-1] if reached else 0
+        return self.config.task.max_obstacles(self.frames_done)
 
     def _sample(self, episodes: torch.Tensor) -> TensorDict:
         task = self.config.task
@@ -228,12 +224,8 @@ class PushEnv(EnvBase):
         if self.config.task.random_first_age and len(first):
             # Spread by the golden ratio: even over any number of rows, and no draw to keep.
             share = (self._episode[first].double() * 0.6180339887498949) % 1.0
-            self._age[first] = (share * self._limit).long()
+            self._age[first] = (share * self.config.task.max_steps).long()
         self._is_first[rows] = False
-
-    @property
-    def _limit(self) -> int:
-        return round(self.config.task.episode_time / self.config.task.policy_period)
 
     def _build(self, rows: torch.Tensor) -> None:
         scene = self.scenario[rows]
@@ -251,7 +243,7 @@ class PushEnv(EnvBase):
         self._worlds.reset(rows, start)
         # Pushing higher than (edge / 2 - CoM shift) / mu would tip the object; 0.9 is the margin.
         self._controller.reset(rows, 0.9 * edge * (0.5 - task.com_shift) / task.floor_friction[1])
-        stream = ("train", "eval", "vae").index(self.config.task.stream)
+        stream = STREAMS.index(self.config.task.stream)
         self._lidar.reset(rows, noise_key(stream, self._scenario_seed, self._episode[rows]))
 
     def _read(self) -> None:
@@ -262,9 +254,7 @@ class PushEnv(EnvBase):
     def _spawn(self) -> None:
         """Let obstacles appear whose time has come."""
         time = self._elapsed.double() * self.config.task.policy_period
-        slots = torch.arange(scenarios.OBSTACLE_SLOTS, device=self._home)
-        due = (slots < self.scenario["num_obstacles"][:, None]) & (self.scenario["obstacle_time"] <= time[:, None])
-        if not bool((due & ~self._obstacle_active).any()):
+        if not bool(scenarios.due_obstacles(self.scenario, self._obstacle_active, time).any()):
             return
         state, tcp = self.world_state, self._tcp
         active, pose = scenarios.spawn_obstacles(

@@ -169,7 +169,7 @@ def _observe(
 ) -> dict[str, Any]:
     """Return how predictions come true under a condition, and how much is looked."""
     task, chunk = calibration_task(loaded, condition), min(config.chunk, config.episodes)
-    limit = round(loaded.config.env.task.episode_time / task.policy_period)
+    limit = loaded.config.env.task.max_steps
     with closing(loaded.make_env(chunk, task=task, simulator=config.simulator, seed=config.seed)) as env:
         meter = LookingMeter(env, loaded.config.env.lidar, task.policy_period)
         track = Track(loaded.collision_estimator)

@@ -33,7 +33,7 @@ from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.recording import Recording, choose_scenes, record
 from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
 from cura_torchrl.trainers.threads import one_thread
-from cura_torchrl.trainers.train import most_obstacles, train
+from cura_torchrl.trainers.train import train
 from cura_torchrl.trainers.video import encode_animation
 
 if TYPE_CHECKING:
@@ -197,7 +197,7 @@ def _play(
     config: DemoConfig, task: TaskConfig, scenes: list[Scene], labels: Sequence[str], workers: Executor
 ) -> list[_Pair]:
     """Return every scene as both policies play it."""
-    total = _num_states(task) * len(labels)
+    total = (task.max_steps + 1) * len(labels)
     with tqdm(total=total, desc="play", unit="step", file=sys.stderr) as bar, contextlib.ExitStack() as stack:
         if isinstance(workers, _Here):
             report, inbox = bar.update, None
@@ -232,11 +232,6 @@ def _play_one(
             stride=config.frame_stride,
             watch=lambda _: report(1),
         )
-
-
-def _num_states(task: TaskConfig) -> int:
-    # Of an episode that lasts until the time limit.
-    return round(task.episode_time / task.policy_period) + 1
 
 
 def _draw(config: DemoConfig, pairs: Sequence[_Pair], workers: Executor) -> list[Card]:
@@ -311,7 +306,7 @@ def _continued(
 ) -> TrainConfig:
     """Return the run's own configuration as it was in the end, on fewer worlds."""
     run = loaded.config
-    most = most_obstacles(run.env.task, loaded.record["frames"])
+    most = run.env.task.max_obstacles(loaded.record["frames"])
     scenario = dataclasses.replace(run.env.task.scenario, max_obstacles=most)
     task = dataclasses.replace(run.env.task, scenario=scenario, curriculum=(), random_first_age=True)
     last = before[-1].get("lr", math.nan) if before else math.nan

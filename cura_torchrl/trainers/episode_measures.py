@@ -12,7 +12,6 @@ from cura_torchrl import keys
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
-from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
 from cura_torchrl.trainers.active_perception import Sightings
 
 if TYPE_CHECKING:
@@ -46,31 +45,6 @@ class Measures:
     """Time from an obstacle's appearance to the first ray that hits it, mean over those that are hit [s]."""
     longest_delay: float | None
     """The longest of these times [s]."""
-
-
-def bodies(
-    base_pose: torch.Tensor, tcp: torch.Tensor, object_pose: torch.Tensor, object_edge: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return chassis, arm and object as rectangles, the arm as a strip from the chassis's front to the TCP.
-
-    Args:
-        base_pose: Base (x [m], y [m], yaw [rad]), world frame, shape ``[N, 3]``.
-        tcp: TCP in the plane, world frame [m], shape ``[N, 2]``.
-        object_pose: Object (x [m], y [m], yaw [rad]), world frame, shape ``[N, 3]``.
-        object_edge: Its edge [m], shape ``[N]``.
-
-    Returns:
-        Their (x [m], y [m], yaw [rad]), shape ``[N, 3, 3]``, and half extents [m], shape ``[N, 3, 2]``.
-    """
-    chassis = base_pose.new_tensor(CHASSIS_SIZE) / 2
-    front = geometry.from_frame(base_pose, torch.stack([chassis[0], torch.zeros_like(chassis[0])]).expand_as(tcp))
-    reach = tcp - front
-    arm = torch.cat([(front + tcp) / 2, geometry.angle_of(reach)[:, None]], -1)
-    length = geometry.norm(reach)
-    arm_half = torch.stack([length / 2, scenarios.arm_half_width(length)], -1)
-    object_half = (object_edge / 2)[:, None].expand_as(tcp)
-    half = torch.stack([chassis.expand_as(tcp), arm_half, object_half], 1)
-    return torch.stack([base_pose, arm, object_pose], 1), half
 
 
 def clearance(pose: torch.Tensor, half: torch.Tensor, obstacles: torch.Tensor) -> torch.Tensor:
@@ -162,7 +136,9 @@ class EpisodeMeter:
         obstacles = state[keys.OBSTACLES].double()
         base, reach = state[keys.SENSOR_POSE].double(), state[keys.OBSERVATION][:, OBSERVATION_SLICES["tcp_position"]]
         tcp = geometry.from_frame(base, reach[:, :2].double())
-        pose, half = bodies(base, tcp, state[keys.OBJECT_POSE].double(), state[keys.OBJECT_SIZE][:, 0].double())
+        pose, half = scenarios.bodies(
+            base, tcp, state[keys.OBJECT_POSE].double(), state[keys.OBJECT_SIZE][:, 0].double()
+        )
         # Circles around the shapes bound their distance from below: most obstacles are too far away to matter.
         apart = geometry.norm(pose[:, None, :, :2] - obstacles[:, :, None, :2]) - geometry.norm(half)[:, None]
         bound = apart.amin(-1) - obstacles[..., 3] * math.sqrt(0.5)

@@ -89,7 +89,7 @@ class _Source:
         self._map = next(part for part in env.transform if isinstance(part, ConfidenceMap))
         self.grid = self._map.grid
         self._sightings = Sightings(base.config.lidar.max_range)
-        steps = round(base.config.task.episode_time / base.config.task.policy_period) + 1
+        steps = base.config.task.max_steps + 1
         self._paths = torch.zeros(base.num_envs, steps, 8, dtype=torch.float64)
         self.state = env.reset()
         self._note()
@@ -182,7 +182,7 @@ def against_truth(
         draws agree with what was seen; ``episode``; ``by_risk``, whether it was drawn in proportion to its risk.
     """
     options: dict[str, Any] = {"task": task, "simulator": "planar"}
-    rows, limit = config.futures, round(loaded.config.env.task.episode_time / task.policy_period)
+    rows, limit = config.futures, loaded.config.env.task.max_steps
     notes: dict[str, list[Any]] = defaultdict(list)
     generator = torch.Generator().manual_seed(config.seed)
     worlds = _WORLDS + (rows == _WORLDS)  # what clones go into has another number of worlds

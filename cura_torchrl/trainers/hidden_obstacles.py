@@ -231,18 +231,16 @@ def _replay(
     active, since = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape)
     pose = torch.zeros(*shape, 3, dtype=torch.float64)
     pose[:, :known], since[:, :known] = past.seen[:, :3], past.seen_since.to(since)
-    slots = torch.arange(shape[1])
-    comes = slots < scene["num_obstacles"][:, None]
     for step in range(len(past.base_pose)):
         active[:, :known] = past.seen_since <= step
-        time = step * period
-        rows = (comes & ~active & (scene["obstacle_time"] <= time)).any(-1).nonzero().squeeze(-1)
+        time = torch.full(shape[:1], step * period, dtype=torch.float64)
+        rows = scenarios.due_obstacles(scene, active, time).any(-1).nonzero().squeeze(-1)
         if len(rows) == 0:
             continue
         count = len(rows)
         is_there, where = scenarios.spawn_obstacles(
             config, scene[rows], active[rows], pose[rows],
-            time=torch.full((count,), time, dtype=torch.float64), base_pose=past.base_pose[step].expand(count, 3),
+            time=time[rows], base_pose=past.base_pose[step].expand(count, 3),
             tcp_position=past.tcp_position[step].expand(count, 2),
             object_pose=past.object_pose[step].expand(count, 3),
         )  # fmt: skip

@@ -17,7 +17,7 @@ from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
 from cura_torchrl.envs.robots.ridgeback_franka import HOME_TCP
-from cura_torchrl.trainers.episode_measures import bodies, clearance
+from cura_torchrl.trainers.episode_measures import clearance
 from cura_torchrl.trainers.evaluate import Episode, play_episodes
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ class Recording:
     def clearance(self) -> NDArray[np.float64]:
         """Distance from chassis, arm and object to the nearest obstacle [m], shape ``[T]``; infinite without one."""
         base, tcp, pushed = (torch.from_numpy(track).double() for track in (self.base_pose, self.tcp, self.object_pose))
-        pose, half = bodies(base, tcp, pushed, base.new_full((len(base),), self.scene.object_edge))
+        pose, half = scenarios.bodies(base, tcp, pushed, base.new_full((len(base),), self.scene.object_edge))
         return clearance(pose[:, None], half[:, None], torch.from_numpy(self.obstacles).double()).amin(1).numpy()
 
     @property

@@ -73,7 +73,7 @@ def play_scene(config: RenderConfig, loaded: Sequence[LoadedPolicy]) -> list[Rec
     """
     recordings = []
     tasks = [evaluation_task(policy.config.env.task, config) for policy in loaded]
-    total = sum(round(task.episode_time / task.policy_period) + 1 for task in tasks)
+    total = sum(task.max_steps + 1 for task in tasks)
     with tqdm(total=total, desc="play", unit="step", file=sys.stderr) as bar:
 
         def note(_: torch.Tensor) -> None:

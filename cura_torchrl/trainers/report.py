@@ -142,7 +142,7 @@ def _play(config: ReportConfig, players: list[Run]) -> tuple[Recording, ...]:
     task = evaluation_task(trained.env.task, config)
     config = dataclasses.replace(config, simulator=config.simulator or trained.simulator)
     scene = find_scene(task.scenario, seed=config.seed, index=config.scene)
-    states = round(task.episode_time / task.policy_period) + 1
+    states = task.max_steps + 1
     with tqdm(total=states * len(players), desc="play", unit="step", file=sys.stderr) as bar, one_thread():
         played = tuple(_play_one(config, player, scene, bar) for player in players)
         bar.update(bar.total - bar.n)

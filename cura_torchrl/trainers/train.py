@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
     from torchrl.collectors import BaseCollector
 
-    from cura_torchrl.envs.config import TaskConfig
     from cura_torchrl.trainers.config import TrainConfig
 
 logger = logging.getLogger(__name__)
@@ -99,27 +98,6 @@ class RandomState(GlobalRNGState):
         """
         is_there = torch.cuda.is_available()
         super().load_state_dict({name: value for name, value in state_dict.items() if is_there or name != "torch_cuda"})
-
-
-def most_obstacles(task: TaskConfig, frames: int) -> int:
-    """Return K, the most obstacles that an episode may have now.
-
-    Args:
-        task: Curriculum and scenario.
-        frames: Environment steps so far [1].
-
-    Returns:
-        Number of obstacles [1].
-
-    Examples:
-        >>> from cura_torchrl.envs.config import TaskConfig
-        >>> most_obstacles(TaskConfig(curriculum=((0, 0), (1000, 2))), 999)
-        0
-    """
-    if not task.curriculum:
-        return task.scenario.max_obstacles
-    reached = [count for start, count in task.curriculum if start <= frames]
-    return reached[-1] if reached else 0
 
 
 def _require_device(name: str) -> None:
@@ -228,7 +206,7 @@ class _Run:
             recent.extend(finished_episodes(batch))
             row = {
                 "frames": self.learner.frames + batch.numel(),
-                "max_obstacles": most_obstacles(self.config.env.task, self.learner.frames),
+                "max_obstacles": self.config.env.task.max_obstacles(self.learner.frames),
                 **recent.rates(),
                 **rollout_statistics(batch),
                 **self.learner.update(batch),

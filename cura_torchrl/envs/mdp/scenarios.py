@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDict
 
 from cura_torchrl.envs import geometry
-from cura_torchrl.envs.config import require
+from cura_torchrl.envs.config import STREAMS, require
 
 if TYPE_CHECKING:
     from cura_torchrl.envs.config import ScenarioConfig, Stream
@@ -34,8 +34,6 @@ ARM_LEAST_REACH = 1e-3
 
 CHASSIS_START_GAP = 0.1
 """Least distance of the chassis from the plane of the object's rear face at the start [m]."""
-
-_STREAM_IDS = {"train": 0, "eval": 1, "vae": 2}
 
 _DRAWS = (
     "object_edge", "object_mass", "floor_friction", "com_x", "com_y", "com_z", "object_y", "object_yaw",
@@ -130,6 +128,22 @@ def sample_scenarios(
     return TensorDict(leaves, batch_size=episodes.shape)
 
 
+def due_obstacles(scenario: TensorDict, active: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+    """Return which obstacles' time has come and which are not there yet, as far as the episode has them.
+
+    Args:
+        scenario: From :func:`sample_scenarios`, batch size ``[B]``.
+        active: Whether each obstacle is there already, bool, shape ``[B, 6]``.
+        time: Time since the start of the episode [s], shape ``[B]``.
+
+    Returns:
+        Mask, bool, shape ``[B, 6]``.
+    """
+    slots = torch.arange(active.shape[1], device=active.device)
+    comes = slots < scenario["num_obstacles"].unsqueeze(-1)
+    return comes & ~active & (scenario["obstacle_time"] <= time.unsqueeze(-1))
+
+
 def spawn_obstacles(
     config: ScenarioConfig,
     scenario: TensorDict,
@@ -162,18 +176,15 @@ def spawn_obstacles(
     Returns:
         New ``(active, pose)``, same shapes. What was active is unchanged.
     """
-    slot_index = torch.arange(active.shape[1], device=active.device)
-    is_due = ~active & (slot_index < scenario["num_obstacles"].unsqueeze(-1))
-    is_due = is_due & (time.unsqueeze(-1) >= scenario["obstacle_time"])
     # Rectangle distances are the costly part and few obstacles are due in a step: only those are computed.
-    rows, slots = is_due.nonzero(as_tuple=True)
+    rows, slots = due_obstacles(scenario, active, time).nonzero(as_tuple=True)
     if len(rows) == 0:
         return active.clone(), pose.clone()
     place = torch.zeros_like(scenario["obstacle_place"])
     has_room = torch.zeros(place.shape[:-1], dtype=torch.bool, device=place.device)
     uniform, goal = scenario["obstacle_place"][rows, slots], scenario["goal_pose"][rows, :2]
     due_place, is_allowed = _places(config, uniform, scenario["adversarial"][rows], object_pose[rows, :2], goal)
-    surfaces = _surfaces(base_pose[rows], tcp_position[rows], object_pose[rows], scenario["object_edge"][rows])
+    surfaces = bodies(base_pose[rows], tcp_position[rows], object_pose[rows], scenario["object_edge"][rows])
     yaw, edge = scenario["obstacle_yaw"][rows, slots], scenario["obstacle_edge"][rows, slots]
     place[rows, slots] = due_place
     has_room[rows, slots] = is_allowed & (_clearance(due_place, yaw, edge, surfaces) >= config.obstacle_clearance)
@@ -227,21 +238,31 @@ def _places(
     return torch.where(is_adversarial.unsqueeze(-1), on_line, region), is_inside | ~is_adversarial
 
 
-def _surfaces(
+def bodies(
     base_pose: torch.Tensor, tcp_position: torch.Tensor, object_pose: torch.Tensor, object_edge: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return chassis, arm and object as rectangles: poses ``[M, 3, 3]`` and half extents ``[M, 3, 2]``."""
+    """Return chassis, arm and object as rectangles, the arm as a strip from the chassis's front to the TCP.
+
+    Args:
+        base_pose: Base (x [m], y [m], yaw [rad]), world frame, shape ``[N, 3]``.
+        tcp_position: TCP in the plane, world frame [m], shape ``[N, 2]``.
+        object_pose: Object (x [m], y [m], yaw [rad]), world frame, shape ``[N, 3]``.
+        object_edge: Its edge [m], shape ``[N]``.
+
+    Returns:
+        Their (x [m], y [m], yaw [rad]), shape ``[N, 3, 3]``, and half extents [m], shape ``[N, 3, 2]``.
+    """
     chassis_half = base_pose.new_tensor(CHASSIS_HALF).expand(len(base_pose), 2)
     front = geometry.from_frame(base_pose, base_pose.new_tensor((CHASSIS_HALF[0], 0.0)).expand(len(base_pose), 2))
     arm = tcp_position - front
     arm_pose = torch.cat(((front + tcp_position) / 2, geometry.angle_of(arm).unsqueeze(-1)), -1)
     arm_length = geometry.norm(arm)
-    arm_half = torch.stack((arm_length / 2, arm_half_width(arm_length)), -1)
+    arm_half = torch.stack((arm_length / 2, _arm_half_width(arm_length)), -1)
     object_half = (object_edge / 2).unsqueeze(-1).expand(-1, 2)
     return torch.stack((base_pose, arm_pose, object_pose), -2), torch.stack((chassis_half, arm_half, object_half), -2)
 
 
-def arm_half_width(reach: torch.Tensor) -> torch.Tensor:
+def _arm_half_width(reach: torch.Tensor) -> torch.Tensor:
     """Return half the width of the strip that stands for the arm, 0 where there is none.
 
     Args:
@@ -275,7 +296,7 @@ def _uniforms(
     require(not (index < 0).any(), "episodes", episodes, "indices that are not negative")
     num_slot_draws = 3 * OBSTACLE_SLOTS
     count = len(_DRAWS) + num_slot_draws + 2 * OBSTACLE_SLOTS * config.num_fallbacks
-    key = np.array([seed, _STREAM_IDS[stream]], dtype=np.uint64)
+    key = np.array([seed, STREAMS.index(stream)], dtype=np.uint64)
     # The counter's first word counts the blocks of an episode's draws: the episode is the second.
     streams = [np.random.Philox(key=key, counter=[0, episode, 0, 0]) for episode in index.tolist()]
     draws = np.array([np.random.Generator(bits).random(count) for bits in streams]).reshape(len(index), count)

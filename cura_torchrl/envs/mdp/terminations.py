@@ -76,6 +76,6 @@ def endings(
         ``(terminated, truncated)``, bool, shape ``[N]`` each; never both true.
     """
     terminated = contact.any(-1)
-    is_late = elapsed_steps >= round(task.episode_time / task.policy_period)
+    is_late = elapsed_steps >= task.max_steps
     is_over = steps_since_success >= round(task.success_time / task.policy_period)
     return terminated, (is_late | is_over) & ~terminated

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from cura_torchrl.envs.mdp.scenarios import CHASSIS_HALF
 from cura_torchrl.envs.simulation.interface import RobotShape
 
 URDF = Path(__file__).parent / "assets" / "ridgeback.urdf"
@@ -19,7 +20,7 @@ ACTION_SIZE = BASE_DOF
 
 BASE_LINK = "base_link"
 
-CHASSIS_SIZE = (0.960, 0.793)
+CHASSIS_SIZE = (2.0 * CHASSIS_HALF[0], 2.0 * CHASSIS_HALF[1])
 """Length and width of the base [m]; Clearpath Ridgeback data sheet."""
 
 CHASSIS_HEIGHT = 0.18

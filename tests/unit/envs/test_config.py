@@ -83,3 +83,10 @@ def test_defaults_are_valid_frozen_and_documented(config: type):
         setattr(made, name, None)
     assert made == config()
     assert dataclasses.replace(made) == made
+
+
+def test_the_curriculum_counts_frames() -> None:
+    """Catches a curriculum that is one step off, or one that plays all obstacles before its first step."""
+    task = TaskConfig(curriculum=((100, 1), (200, 3)))
+    assert [task.max_obstacles(frames) for frames in (0, 99, 100, 199, 200, 10**9)] == [0, 0, 1, 1, 3, 3]
+    assert TaskConfig().max_obstacles(0) == 6

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import pytest
 import torch
 
-from cura_torchrl.envs.config import TaskConfig
 from cura_torchrl.trainers import train as module
 from cura_torchrl.trainers.build import Networks, build_collector
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint, read_config
@@ -25,7 +24,7 @@ from cura_torchrl.trainers.errors import (
 from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.run_folder import locked
-from cura_torchrl.trainers.train import RandomState, most_obstacles, train
+from cura_torchrl.trainers.train import RandomState, train
 from tests.runs import FRAMES, small_run
 
 if TYPE_CHECKING:
@@ -182,13 +181,6 @@ def test_a_number_that_is_not_finite_leaves_the_last_checkpoint(
     path = find_checkpoint(config.run_dir)
     assert read_config(path)[1]["frames"] == FRAMES
     assert len(list((config.run_dir / CHECKPOINT_FOLDER).iterdir())) == 2
-
-
-def test_the_curriculum_counts_frames() -> None:
-    """Catches a curriculum that is one step off, or one that plays all obstacles before its first step."""
-    task = TaskConfig(curriculum=((100, 1), (200, 3)))
-    assert [most_obstacles(task, frames) for frames in (0, 99, 100, 199, 200, 10**9)] == [0, 0, 1, 1, 3, 3]
-    assert most_obstacles(TaskConfig(), 0) == 6
 
 
 @pytest.mark.slow
