@@ -19,8 +19,8 @@ _INTRODUCTION = (
     "only through one planar LiDAR, so the box hides what lies ahead of it, while obstacles (grey) appear on the way. "
     "Both policies play the same scenes: {first} and, beside it, {second}. "
     "The animations also show what the robot has seen and how recently (confidence), where it saw obstacles "
-    "(occupancy), and the distribution of the collision possibility C that its estimator predicts, whose mean is the "
-    "risk R and whose variance is the uncertainty U."
+    "(occupancy), and the distribution of the collision possibility C that its estimator predicts, from which a "
+    "method takes the risk R and the uncertainty U: the paper the mean and the variance."
 )
 
 

@@ -27,7 +27,8 @@ _INTRODUCTION = (
     'A robot (<span class="robot">green</span>) pushes a box (<span class="object">magenta</span>) to a goal and sees '
     "through one planar LiDAR. The box hides what lies ahead of it, while obstacles (grey) appear on the way. Beside "
     "the policy a network is trained, the distributional collision estimator (DCE), which predicts the distribution of "
-    "the collision possibility C: its mean is the risk R, its variance the uncertainty U."
+    "the collision possibility C. From it a method takes the risk R and the uncertainty U: the paper the mean and the "
+    "variance."
 )
 _LAST = 15
 """Updates that the table's means are over [1]."""
@@ -91,8 +92,8 @@ def run_section(source: str, loaded: LoadedPolicy, rows: Rows, others: Sequence[
         "Method": f"{method_label(loaded)} ({config.method})",
         "What it is": f"LiDAR {sees}; confidence map with decay {config.map.decay:g} a step; weights of the costs in "
         f"the advantage: risk {config.cura.risk_coeff:g}, uncertainty {config.cura.uncertainty_coeff:g}",
-        "Trained for": f"{record['frames']:,} environment steps on {config.simulator}, {config.num_envs} worlds side "
-        f"by side on {config.device}, seed {record['seed']}",
+        "Trained for": f"{record['frames']:,} environment steps on {config.simulator}, the last ones on "
+        f"{config.device}, {config.num_envs} worlds side by side, seed {record['seed']}",
         "Time of training": _training_time(rows),
         "Commit": str(record["commit"]),
         "Versions": ", ".join(f"{name} {version}" for name, version in record["versions"].items()),

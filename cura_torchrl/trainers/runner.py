@@ -71,7 +71,7 @@ class Runner:
             Action in -1 to 1 as shares of the limits, risk and uncertainty [1].
 
         Raises:
-            ValueError: If an input has another size, or one other than the scan is not finite.
+            ValueError: If an input has another size, one other than the scan is not finite, or the object has no size.
         """  # noqa: DOC502 - raised by what this calls
         seen = {
             name: self._checked(name, value)
@@ -92,6 +92,9 @@ class Runner:
             raise ValueError(msg)
         if name != "scan" and not np.isfinite(array).all():
             msg = f"{name} is {array.tolist()}; accepted: finite numbers"
+            raise ValueError(msg)
+        if name == "object_size" and not (array > 0.0).all():
+            msg = f"{name} is {array.tolist()}; accepted: positive numbers [m]"
             raise ValueError(msg)
         return array.reshape(shape)
 

@@ -176,6 +176,8 @@ def test_runner_refuses_what_it_would_take_for_free_space(runner: Runner) -> Non
         runner.step(np.ones(360), **{**good, "pose": [np.nan, 0.0, 0.0]})
     with pytest.raises(ValueError, match="scan has 720 numbers; accepted: 360"):
         runner.step(np.ones(720), **good)
+    with pytest.raises(ValueError, match=r"object_size is \[1\.0, 0\.0\]; accepted: positive numbers"):
+        runner.step(np.ones(360), **{**good, "object_size": [1.0, 0.0]})
     runner.step(np.full(360, np.nan), **good)
 
 
