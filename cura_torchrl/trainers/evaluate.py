@@ -33,6 +33,13 @@ if TYPE_CHECKING:
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
+    from cura_torchrl.envs.config import Simulator
+
+
+BATCHES: dict[Simulator, int] = {"bullet": 5, "planar": 20}
+"""Scenes of a part for each of its worlds [1]. Towards a part's end worlds wait for the last ones, so that large parts
+waste less; but one that is cut off is lost, and on PyBullet it takes longer."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
@@ -260,7 +267,7 @@ def part_size(config: EvaluateConfig) -> int:
     Returns:
         Episodes of a part [1]; the last one may have fewer.
     """
-    return 5 * config.chunk
+    return BATCHES[config.simulator] * config.chunk
 
 
 def parts_of(config: EvaluateConfig) -> list[Part]:

@@ -23,7 +23,7 @@ from cura_torchrl.trainers.build import Networks
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
 from cura_torchrl.trainers.episode_measures import Measures
 from cura_torchrl.trainers.errors import CheckpointError, RunError, UnavailableError
-from cura_torchrl.trainers.evaluate import Episode, Part, Player
+from cura_torchrl.trainers.evaluate import BATCHES, Episode, Part, Player
 from cura_torchrl.trainers.methods import METHODS as METHOD_LABELS
 from cura_torchrl.trainers.outcomes import PolicyRecord
 from cura_torchrl.trainers.paper_table import PAPER_CELLS, PAPER_SUCCESS, paper_success
@@ -46,8 +46,9 @@ CELLS = ("uniform-0.5", "adversarial-1.0")
 
 @pytest.fixture(scope="module", autouse=True)
 def short() -> Iterator[None]:
-    """Scenes are over after five steps."""
-    with short_evaluation():
+    """Scenes are over after five steps, and a part has five for each world."""
+    with short_evaluation(), pytest.MonkeyPatch.context() as patch:
+        patch.setitem(BATCHES, "planar", 5)
         yield
 
 
@@ -125,11 +126,12 @@ def test_a_run_that_was_broken_off_ends_with_the_same_table(tmp_path: Path, monk
 
 
 def shorten_episodes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the processes that are started, and theirs, play episodes of one second."""
+    """Let the processes that are started, and theirs, play episodes of one second, in parts of five for each world."""
     patch = """import functools
 from cura_torchrl.envs.config import TaskConfig
-from cura_torchrl.trainers import evaluation_task
+from cura_torchrl.trainers import evaluate, evaluation_task
 evaluation_task.TaskConfig = functools.partial(TaskConfig, episode_time=1.0)
+evaluate.BATCHES["planar"] = 5
 """
     folder.mkdir()
     (folder / "sitecustomize.py").write_text(patch, encoding="utf-8")
