@@ -50,7 +50,7 @@ test-slow: $(STAMP) ## The tests that take more than half a minute each
 	$(PYTEST) -n $(WORKERS) -m "slow and not gpu" tests
 
 test-ray: $(STAMP) ## Those of them that start a Ray cluster of two nodes, one after the other
-	$(PYTEST) -m "slow and not gpu" tests/unit/trainers/test_ray_backend.py
+	$(PYTEST) -m "slow and not gpu" tests/unit/trainers/training/test_ray_backend.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check $(SOURCES)

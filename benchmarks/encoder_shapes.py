@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from cura_torchrl.modules import MapVAE
-from cura_torchrl.trainers.bench_report import measure, timed
+from cura_torchrl.trainers.benches.report import measure, timed
 from cura_torchrl.trainers.info import provenance
 from cura_torchrl.trainers.pretrain_map import FIGURES_NAME, WEIGHTS_NAME
 

@@ -18,8 +18,8 @@ import torch
 
 from cura_torchrl.trainers.build import Networks, build_collector
 from cura_torchrl.trainers.info import provenance
-from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.methods import method
+from cura_torchrl.trainers.training.learner import Learner
 
 if TYPE_CHECKING:
     from collections.abc import Callable

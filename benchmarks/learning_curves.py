@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from cura_torchrl.trainers.checkpoint import find_checkpoint, progress_path
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.methods import PRESETS
-from cura_torchrl.trainers.progress import read_progress
+from cura_torchrl.trainers.training.progress import read_progress
 
 PANELS = (
     ("success", "success rate, last 200 episodes [1]"),

@@ -22,9 +22,9 @@ from tensordict import TensorDict, TensorDictBase
 
 from cura_torchrl.trainers.build import Networks, build_collector
 from cura_torchrl.trainers.info import provenance
-from cura_torchrl.trainers.learner import Learner
 from cura_torchrl.trainers.methods import method
-from cura_torchrl.trainers.ray_backend import without_scan
+from cura_torchrl.trainers.training.learner import Learner
+from cura_torchrl.trainers.training.ray_backend import without_scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable

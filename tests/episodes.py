@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cura_torchrl.trainers.evaluate import Episode
+from cura_torchrl.trainers.evaluation.episodes import Episode
 
 
 def run_of(letters: str, first: int = 0) -> list[Episode]:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from cura_torchrl.envs.robots.ridgeback_franka import HOME
-from cura_torchrl.trainers.evaluate import Episode
-from cura_torchrl.trainers.recording import Recording, Scene
+from cura_torchrl.trainers.evaluation.episodes import Episode
+from cura_torchrl.trainers.pictures.recording import Recording, Scene
 
 NUM_STATES = 7
 """States of a recording; frames are states 0, 3 and 6."""

@@ -12,10 +12,10 @@ import torch
 
 from cura_torchrl.envs.config import TaskConfig
 from cura_torchrl.modules import MapVAE
-from cura_torchrl.trainers import evaluation_task
 from cura_torchrl.trainers.build import Networks
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
 from cura_torchrl.trainers.config import NetworkConfig
+from cura_torchrl.trainers.evaluation import task as evaluation_task
 from cura_torchrl.trainers.methods import method
 
 if TYPE_CHECKING:

@@ -17,10 +17,10 @@ import torch
 from matplotlib.figure import Figure
 from recording import KINDS, PERIOD, SIZES, save, share_of, task
 
-from cura_torchrl.trainers.active_perception import LookingMeter
-from cura_torchrl.trainers.evaluate import Episode, play_episodes, summarise
+from cura_torchrl.trainers.evaluation.active_perception import LookingMeter
+from cura_torchrl.trainers.evaluation.episodes import Episode, play_episodes, summarise
+from cura_torchrl.trainers.evaluation.statistics import bootstrap_interval
 from cura_torchrl.trainers.loaded_policy import LoadedPolicy, load_policy
-from cura_torchrl.trainers.statistics import bootstrap_interval
 from cura_torchrl.trainers.threads import one_thread
 
 PANELS = (

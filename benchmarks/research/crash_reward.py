@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from recording import PERIOD, estimator_watch, normalised_costs, parser, record, save, task
 from scipy.spatial import cKDTree
 
+from cura_torchrl.trainers.evaluation.statistics import bootstrap_interval
 from cura_torchrl.trainers.loaded_policy import load_policy
-from cura_torchrl.trainers.statistics import bootstrap_interval
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from cura_torchrl import keys
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.robots import route
 from cura_torchrl.envs.robots.scripted import ScriptedAvoider
-from cura_torchrl.trainers.active_perception import obstacles_hit
+from cura_torchrl.trainers.evaluation.active_perception import obstacles_hit
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase

@@ -24,8 +24,8 @@ from cura_torchrl.envs import geometry
 from cura_torchrl.envs.config import LidarConfig, PushEnvConfig, ScenarioConfig, TaskConfig
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.push import PushEnv
-from cura_torchrl.trainers.evaluate import Episode, play_episodes, summarise
-from cura_torchrl.trainers.statistics import bootstrap_interval
+from cura_torchrl.trainers.evaluation.episodes import Episode, play_episodes, summarise
+from cura_torchrl.trainers.evaluation.statistics import bootstrap_interval
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:

@@ -18,9 +18,9 @@ from cura_torchrl.envs import geometry
 from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.objectives.functional import normalise, risk_cost, uncertainty_cost
-from cura_torchrl.trainers.active_perception import unseen_ahead
+from cura_torchrl.trainers.evaluation.active_perception import unseen_ahead
+from cura_torchrl.trainers.evaluation.statistics import wilson_interval
 from cura_torchrl.trainers.info import provenance
-from cura_torchrl.trainers.statistics import wilson_interval
 
 if TYPE_CHECKING:
     import numpy as np

@@ -20,8 +20,8 @@ from cura_torchrl import keys
 from cura_torchrl.envs.robots.scripted import ScriptedPusher
 from cura_torchrl.envs.transforms import ConfidenceMap, EncodeMap
 from cura_torchrl.trainers.build import load_encoder
+from cura_torchrl.trainers.evaluation.statistics import bootstrap_interval, correlation
 from cura_torchrl.trainers.loaded_policy import load_policy
-from cura_torchrl.trainers.statistics import bootstrap_interval, correlation
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:

@@ -19,9 +19,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from cura_torchrl import keys
 from cura_torchrl.objectives.functional import risk_cost, uncertainty_cost
-from cura_torchrl.trainers.cloning import copy_world, vary
+from cura_torchrl.trainers.calibration.cloning import copy_world, vary
+from cura_torchrl.trainers.evaluation.statistics import bootstrap_interval, correlation
 from cura_torchrl.trainers.loaded_policy import load_policy
-from cura_torchrl.trainers.statistics import bootstrap_interval, correlation
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from cura_torchrl.trainers import bench_env, bench_ik, bench_learner, bench_lidar, bench_peers
+from cura_torchrl.trainers.benches import env, ik, learner, lidar, peers
 from cura_torchrl.trainers.info import provenance
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from cura_torchrl.trainers.bench_config import BenchConfig
-    from cura_torchrl.trainers.bench_report import Report
+    from cura_torchrl.trainers.benches.config import BenchConfig
+    from cura_torchrl.trainers.benches.report import Report
 
 OUTPUT_FOLDER = Path("runs/bench")
 """Where results go unless a file is named."""
@@ -27,11 +27,11 @@ BUSY_SHARE = 0.5
 """Load average per core above which a result notes that the machine was busy [1]."""
 
 TARGETS: dict[str, Callable[[BenchConfig], Report]] = {
-    "env": bench_env.run,
-    "learner": bench_learner.run,
-    "lidar": bench_lidar.run,
-    "ik": bench_ik.run,
-    "peers": bench_peers.run,
+    "env": env.run,
+    "learner": learner.run,
+    "lidar": lidar.run,
+    "ik": ik.run,
+    "peers": peers.run,
 }
 """What measures each target."""
 

@@ -31,8 +31,8 @@ from cura_torchrl.modules import (
 )
 from cura_torchrl.objectives import CURAAdvantage, CURALoss, PerceptualObjective
 from cura_torchrl.trainers.errors import RunError, UnavailableError
-from cura_torchrl.trainers.privileged import CODE_SIZE, ObstacleCode
-from cura_torchrl.trainers.ray_backend import RayRollouts, ray_rollouts
+from cura_torchrl.trainers.training.privileged import CODE_SIZE, ObstacleCode
+from cura_torchrl.trainers.training.ray_backend import RayRollouts, ray_rollouts
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator

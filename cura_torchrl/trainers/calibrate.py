@@ -14,17 +14,17 @@ import torch
 from tqdm import tqdm
 
 from cura_torchrl import keys
-from cura_torchrl.trainers.active_perception import LookingMeter
-from cura_torchrl.trainers.calibration import TAIL, Predictions, measure, realised_possibility
-from cura_torchrl.trainers.calibration_config import CONDITIONS, CalibrateConfig
-from cura_torchrl.trainers.calibration_figures import coverage_figure, reliability_figure, truth_figure
-from cura_torchrl.trainers.calibration_report import as_markdown
+from cura_torchrl.trainers.calibration.config import CONDITIONS, CalibrateConfig
+from cura_torchrl.trainers.calibration.figures import coverage_figure, reliability_figure, truth_figure
+from cura_torchrl.trainers.calibration.futures import against_truth, exploration, horizon, summarise
+from cura_torchrl.trainers.calibration.report import as_markdown
+from cura_torchrl.trainers.calibration.scores import TAIL, Predictions, measure, realised_possibility
 from cura_torchrl.trainers.errors import RunError
-from cura_torchrl.trainers.evaluate import play_episodes
-from cura_torchrl.trainers.futures import against_truth, exploration, horizon, summarise
+from cura_torchrl.trainers.evaluation.active_perception import LookingMeter
+from cura_torchrl.trainers.evaluation.episodes import play_episodes
+from cura_torchrl.trainers.evaluation.statistics import bootstrap_interval
 from cura_torchrl.trainers.info import provenance
 from cura_torchrl.trainers.loaded_policy import load_policy
-from cura_torchrl.trainers.statistics import bootstrap_interval
 from cura_torchrl.trainers.threads import one_thread
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def calibration_task(loaded: LoadedPolicy, condition: str) -> TaskConfig:
 
     Args:
         loaded: The policy.
-        condition: Name of one of :data:`~.calibration_config.CONDITIONS`.
+        condition: Name of one of :data:`~.calibration.config.CONDITIONS`.
 
     Returns:
         The task, with the true obstacles in what is emitted.
@@ -112,7 +112,7 @@ def calibration_task(loaded: LoadedPolicy, condition: str) -> TaskConfig:
 
 
 class Track:
-    """What is predicted in every state, as the ``watch`` of :func:`~.evaluate.play_episodes`.
+    """What is predicted in every state, as the ``watch`` of :func:`~.episodes.play_episodes`.
 
     Args:
         estimator: The DCE; writes the atoms.

@@ -20,8 +20,8 @@ from torchrl.checkpoint import Checkpoint, CheckpointRotation, StateDictCheckpoi
 from cura_torchrl.trainers.config import TrainConfig
 from cura_torchrl.trainers.errors import CheckpointError
 from cura_torchrl.trainers.info import git_commit, versions
-from cura_torchrl.trainers.progress import PROGRESS_NAME
-from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
+from cura_torchrl.trainers.training.progress import PROGRESS_NAME
+from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

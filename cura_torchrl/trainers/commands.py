@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from cura_torchrl.trainers.bench_config import BenchConfig
-from cura_torchrl.trainers.calibration_config import CalibrateConfig
+from cura_torchrl.trainers.benches.config import BenchConfig
+from cura_torchrl.trainers.calibration.config import CalibrateConfig
 from cura_torchrl.trainers.command_line import as_text, clean_stdout, load_module, one_line_errors, parse, require_path
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
-from cura_torchrl.trainers.demo_config import DemoConfig
+from cura_torchrl.trainers.deployment.config import ExportConfig
 from cura_torchrl.trainers.errors import RunsFailedError
-from cura_torchrl.trainers.export_config import ExportConfig
+from cura_torchrl.trainers.evaluation.table_config import TableConfig
 from cura_torchrl.trainers.info import capabilities, git_commit, hardware, shipped_methods, versions
 from cura_torchrl.trainers.methods import method
-from cura_torchrl.trainers.render_config import RenderConfig
-from cura_torchrl.trainers.report_config import ReportConfig
-from cura_torchrl.trainers.table_config import TableConfig
-from cura_torchrl.trainers.train_all_config import PlannedRun, TrainAllConfig
-from cura_torchrl.trainers.view_config import ViewConfig
+from cura_torchrl.trainers.pages.demo_config import DemoConfig
+from cura_torchrl.trainers.pages.report_config import ReportConfig
+from cura_torchrl.trainers.pictures.render_config import RenderConfig
+from cura_torchrl.trainers.pictures.view_config import ViewConfig
+from cura_torchrl.trainers.training.train_all_config import PlannedRun, TrainAllConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -116,7 +116,7 @@ def _train_all(arguments: list[str]) -> None:
     config = options.config
     runs = [_plan(config, name, seed, arguments[end + 1 :]) for name in config.methods for seed in config.seeds]
     if options.status:
-        read = load_module("cura_torchrl.trainers.run_status").read_status
+        read = load_module("cura_torchrl.trainers.training.run_status").read_status
         statuses = [read(run) for run in runs]
     else:
         module = load_module("cura_torchrl.trainers.train_all")

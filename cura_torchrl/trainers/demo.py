@@ -18,23 +18,23 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
-from cura_torchrl.trainers import animation, figures
 from cura_torchrl.trainers.build import load_encoder
 from cura_torchrl.trainers.checkpoint import progress_path
-from cura_torchrl.trainers.demo_config import DemoConfig
 from cura_torchrl.trainers.errors import RunError, UnavailableError
-from cura_torchrl.trainers.estimate_figures import distribution_figure
-from cura_torchrl.trainers.evaluate import summarise
+from cura_torchrl.trainers.evaluation.episodes import summarise
 from cura_torchrl.trainers.info import git_commit, hardware, shipped_methods, versions
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.methods import PRESETS, policy_labels
-from cura_torchrl.trainers.page import Card, make_page
-from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
-from cura_torchrl.trainers.recording import Recording, choose_scenes, record
-from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
+from cura_torchrl.trainers.pages.demo_config import DemoConfig
+from cura_torchrl.trainers.pages.demo_page import Card, make_page
+from cura_torchrl.trainers.pictures import animation, figures
+from cura_torchrl.trainers.pictures.estimate_figures import distribution_figure
+from cura_torchrl.trainers.pictures.recording import Recording, choose_scenes, record
+from cura_torchrl.trainers.pictures.video import encode_animation
 from cura_torchrl.trainers.threads import one_thread
 from cura_torchrl.trainers.train import train
-from cura_torchrl.trainers.video import encode_animation
+from cura_torchrl.trainers.training.progress import PROGRESS_NAME, read_progress
+from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from cura_torchrl.envs.config import TaskConfig
     from cura_torchrl.trainers.config import TrainConfig
     from cura_torchrl.trainers.loaded_policy import LoadedPolicy
-    from cura_torchrl.trainers.recording import Scene
+    from cura_torchrl.trainers.pictures.recording import Scene
 
 __all__ = ["DemoConfig", "demo"]
 

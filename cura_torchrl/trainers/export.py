@@ -28,8 +28,8 @@ from cura_torchrl import keys
 from cura_torchrl.envs.transforms import ConfidenceMap
 from cura_torchrl.trainers.build import load_encoder
 from cura_torchrl.trainers.checkpoint import file_sha256
+from cura_torchrl.trainers.deployment.description import Signal, describe, map_signals, policy_signals
 from cura_torchrl.trainers.errors import CheckpointError, RunError, UnavailableError
-from cura_torchrl.trainers.export_description import Signal, describe, map_signals, policy_signals
 from cura_torchrl.trainers.loaded_policy import LoadedPolicy, load_policy
 
 if TYPE_CHECKING:
@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from tensordict import TensorDictBase
 
-    from cura_torchrl.trainers.export_config import ExportConfig
+    from cura_torchrl.trainers.deployment.config import ExportConfig
 
-RUNNER = Path(__file__).with_name("runner.py")
+RUNNER = Path(__file__).with_name("deployment") / "runner.py"
 """The runner that is copied beside the graphs."""
 TOLERANCE = 1e-5
 """Largest difference between a graph and PyTorch in action, atoms, risk or uncertainty [1]."""
@@ -262,7 +262,7 @@ def _describe(stage: Path, loaded: LoadedPolicy, transform: ConfidenceMap) -> No
     """
     path, description = stage / "export.json", describe(loaded, transform)
     path.write_text(json.dumps(description), encoding="utf-8")
-    runner = importlib.import_module("cura_torchrl.trainers.runner")
+    runner = importlib.import_module("cura_torchrl.trainers.deployment.runner")
     found = runner.replay(runner.Runner(stage))
     found.pop("milliseconds")
     if not max(found.values()) <= TOLERANCE:

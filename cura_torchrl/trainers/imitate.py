@@ -30,8 +30,8 @@ from cura_torchrl.trainers.build import Networks, make_env
 from cura_torchrl.trainers.checkpoint import save_checkpoint, sweep
 from cura_torchrl.trainers.config import Perception
 from cura_torchrl.trainers.methods import method
-from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER, locked, require_no_run
 from cura_torchrl.trainers.threads import one_thread
+from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER, locked, require_no_run
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -24,16 +24,16 @@ from cura_torchrl.trainers.checkpoint import (
 )
 from cura_torchrl.trainers.config import TrainConfig
 from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
-from cura_torchrl.trainers.evaluation_task import evaluation_physics, evaluation_task
+from cura_torchrl.trainers.evaluation.task import evaluation_physics, evaluation_task
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.methods import PRESETS
-from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER
+from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
     from cura_torchrl.envs.config import PhysicsConfig, Simulator, TaskConfig
-    from cura_torchrl.trainers.evaluation_task import SceneChoice
+    from cura_torchrl.trainers.evaluation.task import SceneChoice
 
 SHIPPED_FOLDER = Path(__file__).parent / "weights"
 """Folder of the weights that come with the package, one folder a method."""

@@ -24,7 +24,13 @@ from cura_torchrl.modules.map_vae import MapVAE, map_vae_loss
 from cura_torchrl.trainers.decoding import encode
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.info import git_commit, versions
-from cura_torchrl.trainers.map_dataset import MapDataset, RandomPusher, collect_maps, unpack_maps, unpacking_table
+from cura_torchrl.trainers.training.map_dataset import (
+    MapDataset,
+    RandomPusher,
+    collect_maps,
+    unpack_maps,
+    unpacking_table,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from cura_torchrl.trainers.animation import animation_frames, frame_numbers
-from cura_torchrl.trainers.estimate_figures import appearance_figure, distribution_figure
-from cura_torchrl.trainers.evaluation_task import evaluation_task
-from cura_torchrl.trainers.figures import layout_figure, paths_figure, snapshots_figure
+from cura_torchrl.trainers.evaluation.task import evaluation_task
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.methods import policy_labels
-from cura_torchrl.trainers.recording import find_scene, record
-from cura_torchrl.trainers.render_config import RenderConfig
-from cura_torchrl.trainers.scene_view import scene_frames
+from cura_torchrl.trainers.pictures.animation import animation_frames, frame_numbers
+from cura_torchrl.trainers.pictures.estimate_figures import appearance_figure, distribution_figure
+from cura_torchrl.trainers.pictures.figures import layout_figure, paths_figure, snapshots_figure
+from cura_torchrl.trainers.pictures.recording import find_scene, record
+from cura_torchrl.trainers.pictures.render_config import RenderConfig
+from cura_torchrl.trainers.pictures.scene_view import scene_frames
+from cura_torchrl.trainers.pictures.video import encode_animation, require_format
 from cura_torchrl.trainers.threads import one_thread
-from cura_torchrl.trainers.video import encode_animation, require_format
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
     from cura_torchrl.envs.config import TaskConfig
     from cura_torchrl.trainers.loaded_policy import LoadedPolicy
-    from cura_torchrl.trainers.recording import Recording
-    from cura_torchrl.trainers.render_config import FigureName, StillFormat
+    from cura_torchrl.trainers.pictures.recording import Recording
+    from cura_torchrl.trainers.pictures.render_config import FigureName, StillFormat
 
 __all__ = ["RenderConfig", "play_scene", "render"]
 

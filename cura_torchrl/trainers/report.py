@@ -10,26 +10,27 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from cura_torchrl.trainers import figures, report_page
 from cura_torchrl.trainers.build import load_encoder
 from cura_torchrl.trainers.checkpoint import progress_path
 from cura_torchrl.trainers.demo import draw_card
 from cura_torchrl.trainers.errors import RunError
-from cura_torchrl.trainers.estimate_figures import distribution_figure
-from cura_torchrl.trainers.evaluation_task import evaluation_task
-from cura_torchrl.trainers.folder_section import read_folder
+from cura_torchrl.trainers.evaluation.task import evaluation_task
 from cura_torchrl.trainers.loaded_policy import LoadedPolicy, load_policy
-from cura_torchrl.trainers.markup import document
 from cura_torchrl.trainers.methods import method_label, policy_labels
-from cura_torchrl.trainers.progress import read_progress
-from cura_torchrl.trainers.recording import find_scene, record
-from cura_torchrl.trainers.report_config import ReportConfig
+from cura_torchrl.trainers.pages import report_page
+from cura_torchrl.trainers.pages.folder_section import read_folder
+from cura_torchrl.trainers.pages.markup import document
+from cura_torchrl.trainers.pages.report_config import ReportConfig
+from cura_torchrl.trainers.pictures import figures
+from cura_torchrl.trainers.pictures.estimate_figures import distribution_figure
+from cura_torchrl.trainers.pictures.recording import find_scene, record
 from cura_torchrl.trainers.threads import one_thread
+from cura_torchrl.trainers.training.progress import read_progress
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from cura_torchrl.trainers.recording import Recording, Scene
+    from cura_torchrl.trainers.pictures.recording import Recording, Scene
 
 __all__ = ["ReportConfig", "report"]
 

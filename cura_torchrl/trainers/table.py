@@ -12,22 +12,23 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from cura_torchrl.trainers.agreement import agreement, pair
 from cura_torchrl.trainers.config import EvaluateConfig
 from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
-from cura_torchrl.trainers.evaluate import Episode, Part, parts_of, play_parts
+from cura_torchrl.trainers.evaluate import Part, parts_of, play_parts
+from cura_torchrl.trainers.evaluation.agreement import agreement, pair
+from cura_torchrl.trainers.evaluation.outcomes import SHIPPED, CodeRecord, OutcomeStore, PolicyRecord, Scenes
+from cura_torchrl.trainers.evaluation.table_config import CHUNKS, TableConfig, parse_cell
+from cura_torchrl.trainers.evaluation.table_figure import table_figure
+from cura_torchrl.trainers.evaluation.table_numbers import Result, compare
+from cura_torchrl.trainers.evaluation.table_parquet import write_parquet
+from cura_torchrl.trainers.evaluation.table_report import agreement_section, as_csv, as_latex, as_markdown
 from cura_torchrl.trainers.info import git_commit, versions
 from cura_torchrl.trainers.loaded_policy import load_policy
-from cura_torchrl.trainers.outcomes import SHIPPED, CodeRecord, OutcomeStore, PolicyRecord, Scenes
-from cura_torchrl.trainers.table_config import CHUNKS, TableConfig, parse_cell
-from cura_torchrl.trainers.table_figure import table_figure
-from cura_torchrl.trainers.table_numbers import Result, compare
-from cura_torchrl.trainers.table_parquet import write_parquet
-from cura_torchrl.trainers.table_report import agreement_section, as_csv, as_latex, as_markdown
 
 if TYPE_CHECKING:
-    from cura_torchrl.trainers.agreement import Agreement
-    from cura_torchrl.trainers.table_numbers import Played
+    from cura_torchrl.trainers.evaluation.agreement import Agreement
+    from cura_torchrl.trainers.evaluation.episodes import Episode
+    from cura_torchrl.trainers.evaluation.table_numbers import Played
 
 STORE_NAME = "outcomes.sqlite"
 """File of outcomes in the table's folder."""

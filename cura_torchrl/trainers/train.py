@@ -16,11 +16,6 @@ from torchrl.checkpoint import GlobalRNGState
 from cura_torchrl.trainers.build import Networks, build_collector, fitting_encoder
 from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, restore, save_checkpoint, sweep
 from cura_torchrl.trainers.decoding import changed_fields
-from cura_torchrl.trainers.diagnostics import (
-    RecentEpisodes,
-    finished_episodes,
-    rollout_statistics,
-)
 from cura_torchrl.trainers.errors import (
     CheckpointError,
     Interrupted,
@@ -29,11 +24,16 @@ from cura_torchrl.trainers.errors import (
     UnavailableError,
     WorkerError,
 )
-from cura_torchrl.trainers.learner import Learner
-from cura_torchrl.trainers.progress import Progress
-from cura_torchrl.trainers.ray_backend import RayRollouts, require_ray
-from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER, locked, require_no_run
-from cura_torchrl.trainers.warm_start import start_from
+from cura_torchrl.trainers.training.diagnostics import (
+    RecentEpisodes,
+    finished_episodes,
+    rollout_statistics,
+)
+from cura_torchrl.trainers.training.learner import Learner
+from cura_torchrl.trainers.training.progress import Progress
+from cura_torchrl.trainers.training.ray_backend import RayRollouts, require_ray
+from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER, locked, require_no_run
+from cura_torchrl.trainers.training.warm_start import start_from
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -18,10 +18,10 @@ from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, weigh
 from cura_torchrl.trainers.decoding import changed_fields, encode
 from cura_torchrl.trainers.errors import CheckpointError, Interrupted
 from cura_torchrl.trainers.info import hardware
-from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER, is_locked
-from cura_torchrl.trainers.run_status import RunStatus, read_record, read_status, write_record
-from cura_torchrl.trainers.train_all_config import PlannedRun, TrainAllConfig, default_jobs
-from cura_torchrl.trainers.train_all_display import Display
+from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER, is_locked
+from cura_torchrl.trainers.training.run_status import RunStatus, read_record, read_status, write_record
+from cura_torchrl.trainers.training.train_all_config import PlannedRun, TrainAllConfig, default_jobs
+from cura_torchrl.trainers.training.train_all_display import Display
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

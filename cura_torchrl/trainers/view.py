@@ -14,22 +14,22 @@ import torch
 
 from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
 from cura_torchrl.envs.sensors.lidar import ray_angles
-from cura_torchrl.trainers import raster
-from cura_torchrl.trainers.animation import map_image
 from cura_torchrl.trainers.errors import UnavailableError
-from cura_torchrl.trainers.evaluate import play_episodes
-from cura_torchrl.trainers.evaluation_task import evaluation_task
+from cura_torchrl.trainers.evaluation.episodes import play_episodes
+from cura_torchrl.trainers.evaluation.task import evaluation_task
 from cura_torchrl.trainers.loaded_policy import load_policy
-from cura_torchrl.trainers.recording import Recorder, Recording, find_scene, record
+from cura_torchrl.trainers.pictures import raster
+from cura_torchrl.trainers.pictures.animation import map_image
+from cura_torchrl.trainers.pictures.recording import Recorder, Recording, find_scene, record
+from cura_torchrl.trainers.pictures.view_config import ViewConfig
 from cura_torchrl.trainers.threads import one_thread
-from cura_torchrl.trainers.view_config import ViewConfig
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
     from cura_torchrl.trainers.loaded_policy import LoadedPolicy
-    from cura_torchrl.trainers.recording import Scene
+    from cura_torchrl.trainers.pictures.recording import Scene
 
 __all__ = ["ViewConfig", "view"]
 

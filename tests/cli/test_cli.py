@@ -13,21 +13,21 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from cura_torchrl.trainers.bench_config import BenchConfig
-from cura_torchrl.trainers.calibration_config import CalibrateConfig
+from cura_torchrl.trainers.benches.config import BenchConfig
+from cura_torchrl.trainers.calibration.config import CalibrateConfig
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
-from cura_torchrl.trainers.demo_config import DemoConfig
-from cura_torchrl.trainers.export_config import ExportConfig
+from cura_torchrl.trainers.deployment.config import ExportConfig
+from cura_torchrl.trainers.evaluation.table_config import TableConfig
 from cura_torchrl.trainers.methods import PRESETS, method
-from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
-from cura_torchrl.trainers.render_config import RenderConfig
-from cura_torchrl.trainers.report_config import ReportConfig
-from cura_torchrl.trainers.run_folder import is_locked
-from cura_torchrl.trainers.run_status import read_record
-from cura_torchrl.trainers.table_config import TableConfig
-from cura_torchrl.trainers.train_all_config import TrainAllConfig
-from cura_torchrl.trainers.view_config import ViewConfig
+from cura_torchrl.trainers.pages.demo_config import DemoConfig
+from cura_torchrl.trainers.pages.report_config import ReportConfig
+from cura_torchrl.trainers.pictures.render_config import RenderConfig
+from cura_torchrl.trainers.pictures.view_config import ViewConfig
+from cura_torchrl.trainers.training.progress import PROGRESS_NAME, read_progress
+from cura_torchrl.trainers.training.run_folder import is_locked
+from cura_torchrl.trainers.training.run_status import read_record
+from cura_torchrl.trainers.training.train_all_config import TrainAllConfig
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,12 +15,12 @@ import torch
 from cura_torchrl.envs.config import LidarConfig, MapConfig, PushEnvConfig
 from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.envs.simulation.bullet_floor import BulletFloor
-from cura_torchrl.trainers import bench_peers
 from cura_torchrl.trainers.bench import TARGETS, as_table, bench
-from cura_torchrl.trainers.bench_config import BenchConfig
-from cura_torchrl.trainers.bench_env import Episode
-from cura_torchrl.trainers.bench_lidar import see_all_cells
-from cura_torchrl.trainers.bench_report import Report, measure
+from cura_torchrl.trainers.benches import peers as bench_peers
+from cura_torchrl.trainers.benches.config import BenchConfig
+from cura_torchrl.trainers.benches.env import Episode
+from cura_torchrl.trainers.benches.lidar import see_all_cells
+from cura_torchrl.trainers.benches.report import Report, measure
 from cura_torchrl.trainers.errors import UnavailableError
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ from PIL import Image
 from tensordict import TensorDict
 
 from cura_torchrl.trainers.calibrate import _LOOKING, Track, _write, calibrate, looking
-from cura_torchrl.trainers.calibration import LEVELS, PROBABILITY_EDGES, Predictions, measure
-from cura_torchrl.trainers.calibration_config import CalibrateConfig
-from cura_torchrl.trainers.calibration_figures import coverage_figure, reliability_figure, truth_figure
-from cura_torchrl.trainers.calibration_report import as_markdown
-from cura_torchrl.trainers.futures import decompose, summarise
+from cura_torchrl.trainers.calibration.config import CalibrateConfig
+from cura_torchrl.trainers.calibration.figures import coverage_figure, reliability_figure, truth_figure
+from cura_torchrl.trainers.calibration.futures import decompose, summarise
+from cura_torchrl.trainers.calibration.report import as_markdown
+from cura_torchrl.trainers.calibration.scores import LEVELS, PROBABILITY_EDGES, Predictions, measure
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,7 +13,7 @@ from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config
 from cura_torchrl.trainers.demo import PAGE_NAME, TRAINING_FOLDER, DemoConfig, demo, most_telling
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.methods import METHODS
-from cura_torchrl.trainers.progress import read_progress
+from cura_torchrl.trainers.training.progress import read_progress
 from tests.recordings import make_recording
 from tests.runs import tiny_run
 

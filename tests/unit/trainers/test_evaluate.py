@@ -23,8 +23,9 @@ from cura_torchrl.trainers import evaluate as module
 from cura_torchrl.trainers.build import Networks, make_env
 from cura_torchrl.trainers.checkpoint import read_config, save_checkpoint
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
-from cura_torchrl.trainers.evaluate import Episode, Player, evaluate, play_episodes, summarise
-from cura_torchrl.trainers.evaluation_task import evaluation_physics, evaluation_task
+from cura_torchrl.trainers.evaluate import Player, evaluate
+from cura_torchrl.trainers.evaluation.episodes import Episode, play_episodes, summarise
+from cura_torchrl.trainers.evaluation.task import evaluation_physics, evaluation_task
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.loaded_policy import SHIPPED_FOLDER
 from cura_torchrl.trainers.methods import method

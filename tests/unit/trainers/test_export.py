@@ -23,9 +23,9 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from cura_torchrl import load_policy
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.trainers import export as module
+from cura_torchrl.trainers.deployment.config import ExportConfig
+from cura_torchrl.trainers.deployment.runner import Runner
 from cura_torchrl.trainers.errors import CheckpointError, RunError, UnavailableError
-from cura_torchrl.trainers.export_config import ExportConfig
-from cura_torchrl.trainers.runner import Runner
 from tests.runs import tiny_run
 
 SENSED = ("scan", "sensor_pose", "object_pose", "object_size", "observation")

@@ -16,7 +16,7 @@ from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, resto
 from cura_torchrl.trainers.errors import CheckpointError
 from cura_torchrl.trainers.imitate import ImitateConfig, _make_env, _rounds, _train_config, imitate
 from cura_torchrl.trainers.methods import method
-from cura_torchrl.trainers.run_folder import locked
+from cura_torchrl.trainers.training.run_folder import locked
 
 
 @pytest.fixture(scope="module")

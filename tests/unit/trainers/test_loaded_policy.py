@@ -17,7 +17,7 @@ from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, read_config, sav
 from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
 from cura_torchrl.trainers.loaded_policy import export_policy, load_policy
 from cura_torchrl.trainers.methods import method
-from cura_torchrl.trainers.progress import PROGRESS_NAME
+from cura_torchrl.trainers.training.progress import PROGRESS_NAME
 
 
 def test_exported_weights_say_what_trained_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,10 +13,11 @@ from PIL import Image
 from cura_torchrl.trainers import render as render_module
 from cura_torchrl.trainers.config import EvaluateConfig
 from cura_torchrl.trainers.errors import UnavailableError
-from cura_torchrl.trainers.evaluate import evaluate, outcome_letter
+from cura_torchrl.trainers.evaluate import evaluate
+from cura_torchrl.trainers.evaluation.episodes import outcome_letter
 from cura_torchrl.trainers.loaded_policy import load_policy
+from cura_torchrl.trainers.pictures.render_config import FIGURES, RenderConfig
 from cura_torchrl.trainers.render import play_scene, render
-from cura_torchrl.trainers.render_config import FIGURES, RenderConfig
 from tests.recordings import make_recording
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ def test_a_format_that_cannot_be_written_is_refused_before_anything_is_played(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Catches a scene that is played for minutes and then lost."""
-    monkeypatch.setattr("cura_torchrl.trainers.video.importlib.util.find_spec", lambda _: None)
+    monkeypatch.setattr("cura_torchrl.trainers.pictures.video.importlib.util.find_spec", lambda _: None)
     monkeypatch.setattr(render_module, "play_scene", lambda *_: pytest.fail("played"))
     with pytest.raises(UnavailableError, match="format is mp4"):
         render(RenderConfig(formats=("mp4",), out=tmp_path))

@@ -16,7 +16,7 @@ from cura_torchrl.envs.mdp import scenarios
 from cura_torchrl.trainers import report as report_module
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.loaded_policy import load_policy
-from cura_torchrl.trainers.recording import choose_scenes, find_scene
+from cura_torchrl.trainers.pictures.recording import choose_scenes, find_scene
 from cura_torchrl.trainers.report import ReportConfig, report
 from tests.pages import Reader
 from tests.runs import short_evaluation, tiny_run

@@ -21,23 +21,25 @@ import torch
 
 from cura_torchrl.trainers.build import Networks
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
-from cura_torchrl.trainers.episode_measures import Measures
 from cura_torchrl.trainers.errors import CheckpointError, RunError, UnavailableError
-from cura_torchrl.trainers.evaluate import BATCHES, Episode, Part, Player
+from cura_torchrl.trainers.evaluate import BATCHES, Part, Player
+from cura_torchrl.trainers.evaluation.measures import Measures
+from cura_torchrl.trainers.evaluation.outcomes import PolicyRecord
+from cura_torchrl.trainers.evaluation.paper_table import PAPER_CELLS, PAPER_SUCCESS, paper_success
+from cura_torchrl.trainers.evaluation.table_config import TableConfig
+from cura_torchrl.trainers.evaluation.table_figure import table_figure
+from cura_torchrl.trainers.evaluation.table_numbers import compare
+from cura_torchrl.trainers.evaluation.table_parquet import write_parquet
+from cura_torchrl.trainers.evaluation.table_report import as_csv, as_latex, as_markdown, latex
 from cura_torchrl.trainers.methods import METHODS as METHOD_LABELS
-from cura_torchrl.trainers.outcomes import PolicyRecord
-from cura_torchrl.trainers.paper_table import PAPER_CELLS, PAPER_SUCCESS, paper_success
 from cura_torchrl.trainers.table import STORE_NAME, table
-from cura_torchrl.trainers.table_config import TableConfig
-from cura_torchrl.trainers.table_figure import table_figure
-from cura_torchrl.trainers.table_numbers import compare
-from cura_torchrl.trainers.table_parquet import write_parquet
-from cura_torchrl.trainers.table_report import as_csv, as_latex, as_markdown, latex
 from tests.episodes import run_of
 from tests.runs import short_evaluation, small_run
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from cura_torchrl.trainers.evaluation.episodes import Episode
 
 METHODS = ("push-no-occlusion", "push", "cura-ppo")
 METHODS_2 = ("push-conf", "cura-no-risk")
@@ -129,7 +131,8 @@ def shorten_episodes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the processes that are started, and theirs, play episodes of one second, in parts of five for each world."""
     patch = """import functools
 from cura_torchrl.envs.config import TaskConfig
-from cura_torchrl.trainers import evaluate, evaluation_task
+from cura_torchrl.trainers import evaluate
+from cura_torchrl.trainers.evaluation import task as evaluation_task
 evaluation_task.TaskConfig = functools.partial(TaskConfig, episode_time=1.0)
 evaluate.BATCHES["planar"] = 5
 """

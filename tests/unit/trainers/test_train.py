@@ -21,10 +21,10 @@ from cura_torchrl.trainers.errors import (
     UnavailableError,
     WorkerError,
 )
-from cura_torchrl.trainers.learner import Learner
-from cura_torchrl.trainers.progress import PROGRESS_NAME, read_progress
-from cura_torchrl.trainers.run_folder import locked
 from cura_torchrl.trainers.train import RandomState, train
+from cura_torchrl.trainers.training.learner import Learner
+from cura_torchrl.trainers.training.progress import PROGRESS_NAME, read_progress
+from cura_torchrl.trainers.training.run_folder import locked
 from tests.runs import FRAMES, small_run
 
 if TYPE_CHECKING:

@@ -16,10 +16,10 @@ import pytest
 from cura_torchrl.trainers.config import TrainConfig
 from cura_torchrl.trainers.errors import CheckpointError, Interrupted
 from cura_torchrl.trainers.methods import method
-from cura_torchrl.trainers.run_folder import CHECKPOINT_FOLDER, is_locked, locked
-from cura_torchrl.trainers.run_status import read_status
 from cura_torchrl.trainers.train_all import LOG_NAME, train_all, train_command
-from cura_torchrl.trainers.train_all_config import PlannedRun, TrainAllConfig, default_jobs
+from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER, is_locked, locked
+from cura_torchrl.trainers.training.run_status import read_status
+from cura_torchrl.trainers.training.train_all_config import PlannedRun, TrainAllConfig, default_jobs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

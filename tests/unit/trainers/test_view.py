@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from cura_torchrl.trainers.recording import Recording
+    from cura_torchrl.trainers.pictures.recording import Recording
 
 
 @pytest.fixture

@@ -1,0 +1,1 @@
+"""Predictions of the collision estimator against what comes of them, and against simulated futures."""

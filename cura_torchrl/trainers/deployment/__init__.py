@@ -1,0 +1,1 @@
+"""What goes with exported networks to a robot."""

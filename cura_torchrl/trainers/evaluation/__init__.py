@@ -1,0 +1,1 @@
+"""What is played, how it is measured and kept, and the table that is made of it."""

@@ -1,0 +1,1 @@
+"""What happened in an episode or in a training, as pictures, animations and curves."""

@@ -1,0 +1,1 @@
+"""What training needs beside its loop: learner, rollouts on several machines, run folders, progress."""
