@@ -94,7 +94,7 @@ class Result:
     delay: float
     """Time from an obstacle's appearance to the first ray that hits it, mean over those that are hit [s]."""
     difference: float
-    """Success less that of the baseline, on the same scenes [1]."""
+    """Success less that of the :func:`reference`, on the same scenes [1]."""
     difference_low: float
     """Lower bound of its 95 % interval [1]: Newcombe's; over all cells and with several seeds, by bootstrap."""
     difference_high: float
@@ -127,6 +127,23 @@ def compare(played: Played) -> list[Result]:
     cells = list(next(iter(played.values())))
     groups = {cell: [cell] for cell in cells} | ({"all": cells} if len(cells) > 1 else {})
     return [_result(played, method, name, group) for method in played for name, group in groups.items()]
+
+
+def reference(methods: Iterable[str]) -> str:
+    """Return the method that the others are compared with.
+
+    Args:
+        methods: Names of all methods of the table, in its order; at least one.
+
+    Returns:
+        The baseline; the first method in a table without it.
+
+    Examples:
+        >>> reference(["push-no-occlusion", "push"]), reference(["cura-ppo", "cura-cvar"])
+        ('push', 'cura-ppo')
+    """
+    names = list(methods)
+    return BASELINE if BASELINE in names else names[0]
 
 
 def _result(played: Played, method: str, name: str, group: list[str]) -> Result:
@@ -215,10 +232,11 @@ def _interval(trials: list[NDArray[np.bool_]]) -> tuple[float, float, float]:
 
 
 def _difference(played: Played, method: str, group: list[str]) -> tuple[tuple[float, float, float], float]:
-    """Return the difference from the baseline with its interval, and McNemar's p."""
-    if method == BASELINE or BASELINE not in played:
+    """Return the difference from the reference with its interval, and McNemar's p."""
+    against = reference(played)
+    if method == against:
         return _NAN, math.nan
-    pairs = [[_trials(played[who][cell]) for who in (BASELINE, method)] for cell in group]
+    pairs = [[_trials(played[who][cell]) for who in (against, method)] for cell in group]
     if len(pairs) == 1 and len(pairs[0][0]) == 1:
         one, other = pairs[0]
         return paired_difference(one, other), mcnemar(one, other)

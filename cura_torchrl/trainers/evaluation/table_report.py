@@ -8,7 +8,7 @@ import math
 from typing import TYPE_CHECKING
 
 from cura_torchrl.trainers.evaluation.outcomes import SHIPPED
-from cura_torchrl.trainers.evaluation.table_numbers import BASELINE, UNOCCLUDED, Result
+from cura_torchrl.trainers.evaluation.table_numbers import BASELINE, UNOCCLUDED, Result, reference
 from cura_torchrl.trainers.methods import PRESETS
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def _endings(results: list[Result]) -> str:
 
 
 def _differences(results: list[Result]) -> list[str]:
-    """Return the section on the differences from the baseline, nothing where there are none."""
+    """Return the section on the differences from the reference, nothing where there are none."""
     rows = [
         (*_names(r), _with_interval(r.difference, r.difference_low, r.difference_high, "+.1f", 100.0), _p(r.mcnemar_p))
         for r in results
@@ -121,7 +121,7 @@ def _differences(results: list[Result]) -> list[str]:
     if results[0].seeds > 1:
         how = "its 95 % bootstrap interval over seeds and scenes; seeds share scenes, so that there is no p"
     section = [
-        f"## Against {PRESETS[BASELINE].label}",
+        f"## Against {PRESETS[reference(r.method for r in results)].label}",
         f"Difference of the success on the same scenes in points, {how}.",
         _rows(("Method", "Cell", "Difference", "p"), rows),
     ]

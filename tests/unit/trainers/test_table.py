@@ -234,6 +234,15 @@ def test_pairs_and_share_are_those_worked_out_by_hand() -> None:
     assert math.isnan(results[1].difference)  # nobody is compared with himself
 
 
+def test_without_the_baseline_the_first_method_is_compared_with() -> None:
+    """Catches a table of variants of a method that does not tell how they differ."""
+    results = compare(played(cura="sssssscccc", free="sssssssssc"))
+    assert [result.difference for result in results] == [pytest.approx(math.nan, nan_ok=True), pytest.approx(0.3)]
+    page = as_markdown(results, [], "", [])
+    assert "## Against CURA-PPO" in page
+    assert "Share" not in page
+
+
 def test_where_nothing_is_lost_there_is_no_share() -> None:
     """Catches a division by zero, and an interval whose end is at infinity."""
     result = compare(played(free="ssst", push="ssst", cura="ssss"))[-1]
