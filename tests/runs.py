@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from cura_torchrl.envs.config import Simulator
     from cura_torchrl.trainers.config import TrainConfig
 
 FRAMES = 8
@@ -54,12 +55,13 @@ def short_evaluation() -> Iterator[None]:
         yield
 
 
-def tiny_run(name: str, folder: Path) -> Path:
-    """Write a run of untrained networks with short episodes, and return its folder."""
+def tiny_run(name: str, folder: Path, simulator: Simulator = "bullet") -> Path:
+    """Write a run of untrained networks with short episodes, the same each time, and return its folder."""
+    folder.mkdir(exist_ok=True)
     encoder = folder / "map_vae.pt"
     torch.manual_seed(1)
     MapVAE().save(encoder)
-    preset = method(name)
+    preset = method(name).replace(simulator=simulator)
     task = dataclasses.replace(preset.env.task, episode_time=1.0, curriculum=((0, 0), (2000, 1), (9000, 6)))
     small = NetworkConfig(actor_hidden_sizes=(8,), critic_hidden_sizes=(8,), collision_hidden_sizes=(8,))
     config = preset.replace(

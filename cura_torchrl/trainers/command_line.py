@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from cura_torchrl.trainers.errors import RunError
+from cura_torchrl.trainers.info import git_commit
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -108,12 +109,15 @@ def clean_stdout() -> Iterator[None]:
 def load_module(name: str) -> Any:
     """Return a module that needs torch, TorchRL or the simulator, which write to stdout while they are imported.
 
+    From here on the code that runs is what is recorded, even if another commit is checked out meanwhile.
+
     Args:
         name: Its name.
 
     Returns:
         The module.
     """
+    git_commit()
     with clean_stdout():
         module = importlib.import_module(name)
     logging.getLogger("torchrl").setLevel(logging.WARNING)

@@ -311,6 +311,8 @@ class TrainConfig:
             >>> TrainConfig().replace(seed=5).seed
             5
         """
+        if "simulator" in changes and "env" not in changes:
+            changes["env"] = dataclasses.replace(self.env, simulator=changes["simulator"])
         return dataclasses.replace(self, **changes)
 
 

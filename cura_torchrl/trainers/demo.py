@@ -18,19 +18,20 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
+from cura_torchrl.envs.config import ScenarioConfig
 from cura_torchrl.trainers.build import load_encoder
 from cura_torchrl.trainers.checkpoint import progress_path
 from cura_torchrl.trainers.errors import RunError, UnavailableError
 from cura_torchrl.trainers.evaluation.episodes import summarise
+from cura_torchrl.trainers.evaluation.task import evaluation_physics, frozen_task
 from cura_torchrl.trainers.info import git_commit, hardware, shipped_methods, versions
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.methods import PRESETS, policy_labels
 from cura_torchrl.trainers.pages.demo_config import DemoConfig
-from cura_torchrl.trainers.pages.demo_page import Card, make_page
-from cura_torchrl.trainers.pictures import animation, figures
+from cura_torchrl.trainers.pages.demo_page import Card, draw_card, make_page
+from cura_torchrl.trainers.pictures import figures
 from cura_torchrl.trainers.pictures.estimate_figures import distribution_figure
 from cura_torchrl.trainers.pictures.recording import Recording, choose_scenes, record
-from cura_torchrl.trainers.pictures.video import encode_animation
 from cura_torchrl.trainers.threads import one_thread
 from cura_torchrl.trainers.train import train
 from cura_torchrl.trainers.training.progress import PROGRESS_NAME, read_progress
@@ -53,8 +54,6 @@ PAGE_NAME = "index.html"
 """File of the demo's folder that is looked at."""
 TRAINING_FOLDER = "training"
 """Folder of the demo's folder that training writes to."""
-_FRAME_TIME = 0.1
-"""Time for which a frame of a telling scene is shown [s]; the others have half the frames."""
 _FIRST_RATE = 1e-4
 """Largest learning rate to go on with where none is known: Adam has to find its moments again [1]."""
 _Pair = tuple[Recording, Recording]
@@ -74,11 +73,11 @@ def demo(config: DemoConfig) -> Path:
         RunError: If weights or scenes are missing.
     """  # noqa: DOC502 - raised by what this calls
     loaded = [_load(name, config) for name in config.policies]
-    task = _task(config, loaded[0])
-    scenes = _scenes(config, task)
+    tasks = [_task(config, policy) for policy in loaded]
+    scenes = _scenes(config, tasks[0])
     config.run_dir.mkdir(parents=True, exist_ok=True)
     with _workers(config.num_workers) as workers:
-        pairs = _play(config, task, scenes, policy_labels(loaded, config.policies), workers)
+        pairs = _play(config, loaded, tasks, scenes, workers)
         telling = most_telling(pairs, config.telling_scenes)
         cards = _draw(config, [*telling, *(pair for pair in pairs if pair not in telling)], workers)
     for line in _summary(pairs):
@@ -91,7 +90,7 @@ def demo(config: DemoConfig) -> Path:
     }
     page.write_text(make_page(**content, curve=None), encoding="utf-8")
     if config.docs_dir is not None:
-        write_pictures(config.docs_dir, cards[0], task)
+        write_pictures(config.docs_dir, cards[0], tasks[0])
     if config.train_iterations > 0:
         curve = figures.curve_figure(*_train_on(config, loaded[0]))
         page.write_text(make_page(**content, curve=curve), encoding="utf-8")
@@ -157,12 +156,8 @@ def _load(name: str, config: DemoConfig) -> LoadedPolicy:
 
 
 def _task(config: DemoConfig, loaded: LoadedPolicy) -> TaskConfig:
-    task = loaded.config.env.task
-    scenario = dataclasses.replace(
-        task.scenario, kind="mixed", object_edges=config.object_sizes, max_obstacles=config.max_obstacles
-    )
-    # Pictures show the true obstacles; the policies read only what they did in training.
-    return dataclasses.replace(task, scenario=scenario, privileged=True)
+    scenario = ScenarioConfig(kind="mixed", object_edges=config.object_sizes, max_obstacles=config.max_obstacles)
+    return frozen_task(loaded.config.env.task, scenario)
 
 
 def _scenes(config: DemoConfig, task: TaskConfig) -> list[Scene]:
@@ -194,10 +189,14 @@ class _Here(Executor):
 
 
 def _play(
-    config: DemoConfig, task: TaskConfig, scenes: list[Scene], labels: Sequence[str], workers: Executor
+    config: DemoConfig,
+    loaded: Sequence[LoadedPolicy],
+    tasks: Sequence[TaskConfig],
+    scenes: list[Scene],
+    workers: Executor,
 ) -> list[_Pair]:
     """Return every scene as both policies play it."""
-    total = (task.max_steps + 1) * len(labels)
+    total = sum(task.max_steps + 1 for task in tasks)
     with tqdm(total=total, desc="play", unit="step", file=sys.stderr) as bar, contextlib.ExitStack() as stack:
         if isinstance(workers, _Here):
             report, inbox = bar.update, None
@@ -206,8 +205,8 @@ def _play(
             inbox = manager.Queue()
             report = inbox.put
         futures = [
-            workers.submit(_play_one, config, name, task, scenes, label, report)
-            for name, label in zip(config.policies, labels, strict=True)
+            workers.submit(_play_one, config, policy.path, task, scenes, label, report)
+            for policy, task, label in zip(loaded, tasks, policy_labels(loaded, config.policies), strict=True)
         ]
         while inbox is not None and not all(future.done() for future in futures):
             with contextlib.suppress(queue.Empty):
@@ -218,11 +217,19 @@ def _play(
 
 
 def _play_one(
-    config: DemoConfig, name: str, task: TaskConfig, scenes: list[Scene], label: str, report: Callable[[int], object]
+    config: DemoConfig, path: Path, task: TaskConfig, scenes: list[Scene], label: str, report: Callable[[int], object]
 ) -> list[Recording]:
     """Return the recordings of one policy; the scenes run side by side."""
-    loaded = load_policy(name)
-    with one_thread(), closing(loaded.make_env(len(scenes), task=task, keep_map=True, seed=config.seed)) as env:
+    loaded = load_policy(path)
+    env = loaded.make_env(
+        len(scenes),
+        task=task,
+        physics=evaluation_physics(loaded.config.env),
+        simulator=config.simulator,
+        keep_map=True,
+        seed=config.seed,
+    )
+    with one_thread(), closing(env):
         return record(
             env,
             loaded.policy,
@@ -245,25 +252,6 @@ def _draw(config: DemoConfig, pairs: Sequence[_Pair], workers: Executor) -> list
     return cards
 
 
-def draw_card(recordings: tuple[Recording, ...], *, every: int, frame_time: float = _FRAME_TIME) -> Card:
-    """Draw a scene.
-
-    Args:
-        recordings: The scene as each policy played it.
-        every: Every how many recorded frames are shown [1].
-        frame_time: Time for which each recorded frame would be shown [s].
-
-    Returns:
-        The scene with its pictures.
-    """
-    frames = animation.animation_frames(recordings, every=every)
-    return Card(
-        recordings=recordings,
-        paths=figures.paths_figure(recordings),
-        animation=encode_animation(frames, frame_time=every * frame_time),
-    )
-
-
 def _summary(pairs: Sequence[_Pair]) -> Iterator[str]:
     """Yield one line per policy and scenario."""
     for kind in ("adversarial", "uniform"):
@@ -283,7 +271,10 @@ def _facts(config: DemoConfig, loaded: Sequence[LoadedPolicy]) -> dict[str, str]
     for label, policy in zip(policy_labels(loaded, config.policies), loaded, strict=True):
         frames, seed, commit = (policy.record[name] for name in ("frames", "seed", "commit"))
         facts[label] = f"{frames:,} environment steps of training, seed {seed}, commit {commit}"
-    facts["Scenes"] = f"evaluation stream, seed {config.seed}, up to {config.max_obstacles} obstacles, at least one"
+    facts["Scenes"] = (
+        f"evaluation stream, seed {config.seed}, up to {config.max_obstacles} obstacles, at least one; simulator"
+        f" {config.simulator}"
+    )
     facts["Commit"] = git_commit()
     facts["Machine"] = f"{machine['platform']}, {machine['cores']} cores, {machine['memory_gib']} GiB"
     facts["Versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())

@@ -68,6 +68,9 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
         CheckpointError: If the policy's checkpoint is missing or damaged.
     """  # noqa: DOC502 - raised by what this calls
     source = _source(config)
+    if config.policy is None:
+        # A run that is being trained may have a newer checkpoint by the time that a worker looks.
+        config = dataclasses.replace(config, method=None, checkpoint=Path(source["checkpoint"]))
     episodes: list[Episode] = []
     with tqdm(total=config.episodes, unit="episode", file=sys.stderr) as bar:
 

@@ -265,7 +265,7 @@ def _describe(stage: Path, loaded: LoadedPolicy, transform: ConfidenceMap) -> No
     runner = importlib.import_module("cura_torchrl.trainers.deployment.runner")
     found = runner.replay(runner.Runner(stage))
     found.pop("milliseconds")
-    if not max(found.values()) <= TOLERANCE:
+    if not all(difference <= TOLERANCE for difference in found.values()):
         msg = f"graphs differ from PyTorch by {found}; accepted: at most {TOLERANCE}"
         raise RunError(msg)
     description["largest_difference_from_pytorch"] = found

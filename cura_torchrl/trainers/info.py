@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import os
 import platform
@@ -27,8 +28,9 @@ PACKAGES = (
 """Distributions whose versions are recorded beside every checkpoint and result."""
 
 
+@functools.cache
 def versions() -> dict[str, str]:
-    """Return the versions that a result depends on.
+    """Return the versions that a result depends on, those that were found when it was asked first.
 
     Returns:
         Version by distribution, with Python's own; "not installed" where there is none.
@@ -40,8 +42,11 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **{package: _version(package) for package in PACKAGES}}
 
 
+@functools.cache
 def git_commit() -> str:
-    """Return the commit of the checkout that this package is run from.
+    """Return the commit of the checkout that this package is run from, as it was when it was asked first.
+
+    What runs stays in memory, whatever is checked out meanwhile; commands ask before they begin.
 
     Returns:
         The commit's hash, followed by ``-dirty`` where files were changed; "unknown" outside a checkout.

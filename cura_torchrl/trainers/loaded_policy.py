@@ -171,6 +171,8 @@ def export_policy(source: Path, destination: Path | None = None) -> Path:
     curve = progress_path(path)
     if curve.exists():
         shutil.copyfile(curve, progress_path(folder))
+    else:
+        progress_path(folder).unlink(missing_ok=True)  # that of weights that were there before
     origin = {name: record[name] for name in ("versions", "commit")}
     return write_checkpoint({"networks": networks}, released, folder, frames=record["frames"], origin=origin)
 

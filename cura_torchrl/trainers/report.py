@@ -12,12 +12,12 @@ from tqdm import tqdm
 
 from cura_torchrl.trainers.build import load_encoder
 from cura_torchrl.trainers.checkpoint import progress_path
-from cura_torchrl.trainers.demo import draw_card
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.evaluation.task import evaluation_task
 from cura_torchrl.trainers.loaded_policy import LoadedPolicy, load_policy
 from cura_torchrl.trainers.methods import method_label, policy_labels
 from cura_torchrl.trainers.pages import report_page
+from cura_torchrl.trainers.pages.demo_page import draw_card
 from cura_torchrl.trainers.pages.folder_section import read_folder
 from cura_torchrl.trainers.pages.markup import document
 from cura_torchrl.trainers.pages.report_config import ReportConfig
@@ -28,6 +28,7 @@ from cura_torchrl.trainers.threads import one_thread
 from cura_torchrl.trainers.training.progress import read_progress
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
     from pathlib import Path
 
     from cura_torchrl.trainers.pictures.recording import Recording, Scene
@@ -69,7 +70,8 @@ def report(config: ReportConfig) -> Path:
         RunError: If what is to be read is missing or damaged; nothing is played then.
     """
     runs = _load_runs(config)
-    curves = {run.label: run.rows for run in runs if run.rows} | _more_curves(config.curves)
+    curves = {run.label: run.rows for run in runs if run.rows}
+    curves |= _more_curves(config.curves, taken=curves)
     table = None if config.table is None else read_folder(config.table, TABLE_NAME, "table")
     calibration = None if config.calibration is None else read_folder(config.calibration, CALIBRATION_NAME, "calibrate")
     config.out.parent.mkdir(parents=True, exist_ok=True)
@@ -113,8 +115,14 @@ def _load_runs(config: ReportConfig) -> list[Run]:
     ]
 
 
-def _more_curves(paths: tuple[Path, ...]) -> dict[str, list[dict[str, float]]]:
+def _more_curves(paths: tuple[Path, ...], taken: Collection[str]) -> dict[str, list[dict[str, float]]]:
+    """Return the rows of further files, by the file's name; by its path where another curve has that name.
+
+    Raises:
+        RunError: If there are no rows in a file.
+    """
     found = {}
+    stems = [*taken, *(path.stem for path in paths)]
     for path in paths:
         try:
             rows = read_progress(path)
@@ -123,7 +131,7 @@ def _more_curves(paths: tuple[Path, ...]) -> dict[str, list[dict[str, float]]]:
         if not rows or any("frames" not in row for row in rows):
             msg = f"no rows of progress in {path}; accepted: a file like a run's progress.csv"
             raise RunError(msg)
-        found[path.stem] = rows
+        found[path.stem if stems.count(path.stem) == 1 else path.as_posix()] = rows
     return found
 
 

@@ -30,7 +30,7 @@ from cura_torchrl.trainers.training.diagnostics import (
     rollout_statistics,
 )
 from cura_torchrl.trainers.training.learner import Learner
-from cura_torchrl.trainers.training.progress import Progress
+from cura_torchrl.trainers.training.progress import Progress, require_logger
 from cura_torchrl.trainers.training.ray_backend import RayRollouts, require_ray
 from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER, locked, require_no_run
 from cura_torchrl.trainers.training.warm_start import start_from
@@ -52,6 +52,10 @@ _PLACE_FIELDS = {
 """Fields that only say where a run goes on, or follow from another."""
 _DEATH_SIGNS = ("process failed", "failed to initialize", "process object is closed", "Cannot close a process")
 """What TorchRL's and Python's errors say when a worker process has died."""
+
+
+_PATIENCE = 3
+"""Times in a row that workers may die before an update [1]; nodes of a cluster that is started anew look new."""
 
 
 def train(config: TrainConfig, *, resume: bool = False, init_from: Path | None = None) -> Path:
@@ -79,6 +83,7 @@ def train(config: TrainConfig, *, resume: bool = False, init_from: Path | None =
         )
         raise RunError(f"{msg} --init-from with another --run-dir")
     _require_device(config.device)
+    require_logger(config)
     if config.backend == "ray":
         require_ray()
     if config.perception == "map":
@@ -159,8 +164,14 @@ class _Run:
         recent = RecentEpisodes(self.config.recent_episodes)
         try:
             lost: frozenset[str] = frozenset()
+            in_vain = 0
             while self.learner.frames < self.config.total_frames:
+                before = self.learner.frames
                 lost |= self._collect(signals, progress, recent, lost)
+                in_vain = 0 if self.learner.frames > before else in_vain + 1
+                if in_vain == _PATIENCE:
+                    msg = f"workers died {in_vain} times in a row before an update; the last checkpoint is intact"
+                    raise WorkerError(msg)
         except Interrupted:
             # Raised only between updates or while collecting, so what is saved is the end of a whole update.
             self._save()

@@ -58,10 +58,11 @@ def in_processes(
                 if now > told:
                     tick(now - told)
                     told = now
-                for future in done:
+                # What is done first: where a process has died, others may have ended just before.
+                for future in sorted(done, key=lambda future: future.exception() is not None):
                     keep(futures[future], future.result())
         except BrokenProcessPool:
-            msg = "a process that plays has died; what was played is kept, the same command goes on from there"
+            msg = "a process that plays has died; accepted: the same command again, perhaps with fewer workers"
             raise WorkerError(msg) from None
         finally:
             pool.shutdown(wait=False, cancel_futures=True)  # else leaving the block would work on to the end

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -104,7 +105,7 @@ def _curves_figure(
         axis.plot([0.0, 1.0], [0.0, 1.0], color="0.6", linewidth=1, zorder=0)
         axis.set_title(condition, loc="left", fontsize=10)
         axis.grid(alpha=0.3)
-        for (method, found), colour in zip(methods.items(), _COLOURS, strict=False):
+        for (method, found), colour in zip(methods.items(), itertools.cycle(_COLOURS), strict=False):
             points = curve(found[condition])
             _draw(axis, points, label=method, colour=colour)
             seen += [number for place, bars in points for number in (place, bars[0])]

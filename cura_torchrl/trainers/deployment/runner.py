@@ -106,10 +106,11 @@ def replay(runner: Runner) -> dict[str, float]:
         runner: The export.
 
     Returns:
-        Largest difference of action, risk and uncertainty [1], and the median time of a step [ms].
+        Largest difference of action, atoms, risk and uncertainty [1], not a number where there is none, and the median
+        time of a step [ms].
     """
     recorded = np.load(runner.folder / "recording.npz")
-    worst, times = dict.fromkeys(("action", "risk", "uncertainty"), 0.0), []
+    worst, times = dict.fromkeys(("action", "atoms", "risk", "uncertainty"), 0.0), []
     for row, is_first in enumerate(recorded["is_first"]):
         if is_first:
             runner.reset()
@@ -118,7 +119,8 @@ def replay(runner: Runner) -> dict[str, float]:
         runner.step(*inputs)
         times.append(time.perf_counter() - start)
         for name in worst:
-            worst[name] = max(worst[name], float(np.abs(runner.outputs[name][0] - recorded[name][row]).max()))
+            difference = np.abs(runner.outputs[name][0] - recorded[name][row]).max()
+            worst[name] = float(np.maximum(worst[name], difference))  # unlike max(), it lets no NaN pass
     return {**worst, "milliseconds": float(np.median(times)) * 1e3}
 
 

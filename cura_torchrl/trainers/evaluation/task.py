@@ -35,10 +35,7 @@ class SceneChoice(Protocol):
 
 
 def evaluation_task(task: TaskConfig, config: SceneChoice) -> TaskConfig:
-    """Return the task that is evaluated, and the true obstacles in what is emitted.
-
-    Objects, obstacles, tolerances and times are the defaults, whatever a policy was trained on: scenes are paired, and
-    outcomes compared, between policies. Of its own a policy has only the time between two actions.
+    """Return the task whose scenes a configuration chooses.
 
     Args:
         task: What the policy was trained on.
@@ -47,9 +44,25 @@ def evaluation_task(task: TaskConfig, config: SceneChoice) -> TaskConfig:
     Returns:
         The task.
     """
-    scenario = ScenarioConfig(
-        kind=config.scenario, object_edges=(config.object_size,), max_obstacles=config.max_obstacles
+    edges = (config.object_size,)
+    return frozen_task(
+        task, ScenarioConfig(kind=config.scenario, object_edges=edges, max_obstacles=config.max_obstacles)
     )
+
+
+def frozen_task(task: TaskConfig, scenario: ScenarioConfig) -> TaskConfig:
+    """Return the task that is evaluated, and the true obstacles in what is emitted.
+
+    Objects, obstacles, tolerances and times are the defaults, whatever a policy was trained on: scenes are paired, and
+    outcomes compared, between policies. Of its own a policy has only the time between two actions.
+
+    Args:
+        task: What the policy was trained on.
+        scenario: What differs from the default scenario, and the default elsewhere.
+
+    Returns:
+        The task.
+    """
     # The obstacles are there for meters and pictures; a policy reads them only if it says so.
     return TaskConfig(scenario=scenario, stream="eval", privileged=True, policy_period=task.policy_period)
 

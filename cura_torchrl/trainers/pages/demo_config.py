@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from cura_torchrl.envs.config import require, require_finite
+from cura_torchrl.envs.config import Simulator, require, require_finite
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,6 +18,8 @@ class DemoConfig:
     """Who plays: methods whose weights are shipped, or folders of runs; the first one is trained on."""
     scenes: int = 6
     """Scenes of each scenario, adversarial and uniform [1]."""
+    simulator: Simulator = "bullet"
+    """Which simulator runs the worlds that are shown; training goes on where it was begun."""
     object_sizes: tuple[float, ...] = (0.5, 0.75, 1.0)
     """Edges of the pushed cube, which take turns [m]."""
     max_obstacles: int = 6

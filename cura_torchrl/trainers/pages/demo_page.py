@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 from cura_torchrl.trainers.evaluation.episodes import summarise
 from cura_torchrl.trainers.pages.markup import document, image
+from cura_torchrl.trainers.pictures import animation, figures
 from cura_torchrl.trainers.pictures.recording import Recording
+from cura_torchrl.trainers.pictures.video import encode_animation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -23,6 +25,9 @@ _INTRODUCTION = (
     "method takes the risk R and the uncertainty U: the paper the mean and the variance."
 )
 
+FRAME_TIME = 0.1
+"""Time for which a frame of a telling scene is shown [s]; the others have half the frames."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Card:
@@ -34,6 +39,25 @@ class Card:
     """Picture of the paths, PNG."""
     animation: bytes
     """Animation, WebP."""
+
+
+def draw_card(recordings: tuple[Recording, ...], *, every: int, frame_time: float = FRAME_TIME) -> Card:
+    """Draw a scene.
+
+    Args:
+        recordings: The scene as each policy played it.
+        every: Every how many recorded frames are shown [1].
+        frame_time: Time for which each recorded frame would be shown [s].
+
+    Returns:
+        The scene with its pictures.
+    """
+    frames = animation.animation_frames(recordings, every=every)
+    return Card(
+        recordings=recordings,
+        paths=figures.paths_figure(recordings),
+        animation=encode_animation(frames, frame_time=every * frame_time),
+    )
 
 
 def make_page(

@@ -114,7 +114,7 @@ def _layout(recordings: Sequence[Recording]) -> tuple[list[_Column], Image.Image
         column.scene.decorate(background, "Scene from above, world frame")
         column.confidence.decorate(background, "Confidence M: light = seen")
         column.occupancy.decorate(background, "Occupancy O: dark = occupied")
-        column.atoms.decorate(background, "Collision estimate: 50 atoms")
+        column.atoms.decorate(background, f"Collision estimate: {recording.atoms.shape[1]} atoms")
         for panel, name, values, moment, meaning in (
             (column.risk, "Risk R", recording.risk, recording.atoms.mean(1), "mean"),
             (column.uncertainty, "Uncertainty U", recording.uncertainty, recording.atoms.var(1), "variance"),

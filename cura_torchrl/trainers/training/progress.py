@@ -108,11 +108,25 @@ def _rounded(row: dict[str, float]) -> dict[str, str]:
     return {name: f"{value:.10g}" for name, value in row.items()}
 
 
-def _make_logger(config: TrainConfig) -> Logger:
+def require_logger(config: TrainConfig) -> None:
+    """Raise unless the logger can be imported.
+
+    Args:
+        config: The run.
+
+    Raises:
+        UnavailableError: If its package is not installed.
+    """
     if config.logger != "csv" and importlib.util.find_spec(config.logger) is None:
         install = f"pip install cura-torchrl[{config.logger}]"
         msg = f"logger is {config.logger!r}, which is not installed; accepted: csv, or first {install}"
         raise UnavailableError(msg)
+
+
+def _make_logger(config: TrainConfig) -> Logger:
     from torchrl.record.loggers import get_logger  # noqa: PLC0415 - rows are read without torch
 
-    return get_logger(config.logger, logger_name=str(config.run_dir), experiment_name="log")
+    require_logger(config)
+    # A folder of the run, or, where all runs are in one list, the run's name.
+    name = config.run_dir.name if config.logger == "wandb" else "log"
+    return get_logger(config.logger, logger_name=str(config.run_dir), experiment_name=name)

@@ -124,3 +124,10 @@ def test_an_evaluation_needs_exactly_one_policy_and_an_episode(given_: dict[str,
     """Catches a table whose cells were played by another policy than asked for."""
     with pytest.raises(ValueError, match="accepted"):
         EvaluateConfig(**given_)
+
+
+def test_a_copy_on_another_simulator_has_its_worlds_there() -> None:
+    """Catches a planar configuration that cannot be turned back to PyBullet."""
+    planar = TrainConfig(simulator="planar")
+    assert planar.env.simulator == "planar"
+    assert planar.replace(simulator="bullet") == TrainConfig()

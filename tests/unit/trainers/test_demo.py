@@ -6,19 +6,30 @@ import io
 import logging
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from PIL import Image
 
+from cura_torchrl.trainers import demo as module
 from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config
 from cura_torchrl.trainers.demo import PAGE_NAME, TRAINING_FOLDER, DemoConfig, demo, most_telling
 from cura_torchrl.trainers.errors import RunError
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.methods import METHODS
 from cura_torchrl.trainers.training.progress import read_progress
 from tests.recordings import make_recording
-from tests.runs import tiny_run
+from tests.runs import short_evaluation, tiny_run
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short() -> Iterator[None]:
+    """Scenes are over after five steps."""
+    with short_evaluation():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +74,17 @@ def test_demo_plays_writes_its_page_and_trains_on(
             image.load()
     again = demo(tiny_demo(runs, tmp_path / "demo", scenes=1, telling_scenes=0))
     assert "The most telling scenes" not in again.read_text(encoding="utf-8")
+
+
+def test_both_play_in_the_same_worlds_wherever_they_were_trained(tmp_path: Path) -> None:
+    """Catches two policies that are compared on two simulators."""
+    runs = str(tiny_run("cura-ppo", tmp_path / "one")), str(tiny_run("cura-ppo", tmp_path / "two", "planar"))
+    config = tiny_demo(runs, tmp_path)
+    loaded = [load_policy(run) for run in runs]
+    tasks = [module._task(config, policy) for policy in loaded]
+    ((one, other), *_) = module._play(config, loaded, tasks, module._scenes(config, tasks[0]), module._Here())
+    np.testing.assert_array_equal(one.base_pose, other.base_pose)
+    assert np.ptp(one.base_pose[:, 0]) > 0
 
 
 @pytest.mark.slow

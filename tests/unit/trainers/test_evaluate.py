@@ -21,18 +21,18 @@ from cura_torchrl.envs.config import (
 from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.trainers import evaluate as module
 from cura_torchrl.trainers.build import Networks, make_env
-from cura_torchrl.trainers.checkpoint import read_config, save_checkpoint
+from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint, read_config, save_checkpoint
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
-from cura_torchrl.trainers.evaluate import Player, evaluate
+from cura_torchrl.trainers.evaluate import Part, Player, evaluate
 from cura_torchrl.trainers.evaluation.episodes import Episode, play_episodes, summarise
 from cura_torchrl.trainers.evaluation.task import evaluation_physics, evaluation_task
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.loaded_policy import SHIPPED_FOLDER
 from cura_torchrl.trainers.methods import method
-from tests.runs import short_evaluation
+from tests.runs import short_evaluation, tiny_run
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 REQUIRED = {
@@ -204,6 +204,25 @@ def test_the_same_evaluation_gives_the_same_result() -> None:
     """Catches an evaluation that depends on what was played before."""
     config = EvaluateConfig(policy="random", episodes=2, chunk=2, object_size=1.0)
     assert evaluate(config) == evaluate(config)
+
+
+def test_what_is_played_is_the_checkpoint_that_the_result_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches workers that load what a run that is being trained has written since."""
+    run = tiny_run("push", tmp_path)
+    first, parts = find_checkpoint(run), []
+    config, _ = read_config(first)
+
+    def train_on(played: list[Part], *_: object, **options: Callable[..., object]) -> None:
+        save_checkpoint({"networks": Networks(config)}, config, run / CHECKPOINT_FOLDER, frames=9000)
+        parts.extend(played)
+        options["keep"](played[0], [episode(0)])
+
+    monkeypatch.setattr(module, "play_parts", train_on)
+    result = evaluate(EvaluateConfig(checkpoint=run, episodes=1))
+    assert result["checkpoint"] == first.as_posix()
+    assert [part.config.checkpoint for part in parts] == [first]
 
 
 @pytest.mark.slow

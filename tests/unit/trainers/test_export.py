@@ -24,7 +24,7 @@ from cura_torchrl import load_policy
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.trainers import export as module
 from cura_torchrl.trainers.deployment.config import ExportConfig
-from cura_torchrl.trainers.deployment.runner import Runner
+from cura_torchrl.trainers.deployment.runner import Runner, replay
 from cura_torchrl.trainers.errors import CheckpointError, RunError, UnavailableError
 from tests.runs import tiny_run
 
@@ -126,7 +126,7 @@ def test_runner_needs_neither_torch_nor_the_package(exported: Path) -> None:
     assert done.returncode == 0, done.stderr[-1000:]
     found = json.loads(done.stdout)
     assert found.pop("milliseconds") > 0
-    assert set(found) == {"action", "risk", "uncertainty"}
+    assert set(found) == {"action", "atoms", "risk", "uncertainty"}
     assert max(found.values()) <= 1e-5
 
 
@@ -158,6 +158,21 @@ def test_robot_that_stands_on_a_cells_centre_sees(runner: Runner) -> None:
     assert np.isfinite(window).all()
     # The disc of 3 m has pi * 3^2 / 0.1^2 = 2827 cells; its rim of 2 pi * 3 / 0.1 = 188 may count or not.
     assert abs(window[0].sum() - 2827) < 188
+
+
+def test_a_graph_that_answers_with_no_number_does_not_pass(runner: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a comparison that takes not-a-number for no difference."""
+    step = runner.step
+
+    def spoilt(*given: object) -> object:
+        found = step(*given)
+        runner.outputs["atoms"] = np.full_like(runner.outputs["atoms"], np.nan)
+        return found
+
+    monkeypatch.setattr(runner, "step", spoilt)
+    found = replay(runner)
+    assert np.isnan(found["atoms"])
+    assert found["action"] <= module.TOLERANCE
 
 
 def test_reset_forgets(runner: Runner) -> None:

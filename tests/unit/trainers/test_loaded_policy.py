@@ -31,6 +31,9 @@ def test_exported_weights_say_what_trained_them(tmp_path: Path, monkeypatch: pyt
     assert read_config(released)[1]["commit"] == "of the training"
     curve = tmp_path / "release" / f"push-{PROGRESS_NAME}"
     assert curve.read_text(encoding="utf-8") == "frames\n7\n"
+    (tmp_path / "run" / PROGRESS_NAME).unlink()
+    export_policy(tmp_path / "run", released)
+    assert not curve.exists()  # it would be that of other weights
 
 
 def test_exported_weights_load_by_path_and_act_alike(tmp_path: Path) -> None:

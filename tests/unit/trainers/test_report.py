@@ -105,6 +105,16 @@ def test_the_page_tells_what_the_run_is(page: str) -> None:
     assert any(row[:3] == ["episode_time", "1.0", "100.0"] or row[:2] == ["episode_time", "1.0"] for row in rows)
 
 
+def test_curves_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
+    """Catches a curve that takes the place of another whose file has the same name."""
+    paths = tuple(tmp_path / name / "progress.csv" for name in ("one", "two"))
+    for path in paths:
+        path.parent.mkdir()
+        path.write_text("frames,kl\n8,0.5\n", encoding="utf-8")
+    assert list(report_module._more_curves(paths, taken=["progress"])) == [path.as_posix() for path in paths]
+    assert list(report_module._more_curves(paths[:1], taken=["push"])) == ["progress"]
+
+
 def test_what_is_not_given_is_told_with_its_command(folder: Path, tmp_path: Path) -> None:
     """Catches an empty section, and a run without progress or baseline that fails."""
     weights = load_policy(folder / "push").path

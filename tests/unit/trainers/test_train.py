@@ -16,6 +16,7 @@ from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint,
 from cura_torchrl.trainers.errors import (
     CheckpointError,
     Interrupted,
+    NodeLostError,
     NonFiniteError,
     RunError,
     UnavailableError,
@@ -198,6 +199,23 @@ def test_workers_act_with_the_learner_s_present_weights(config: TrainConfig) -> 
                 now = actor.module[0](batch.select("observation", "latent"))
             torch.testing.assert_close(now["loc"], batch["loc"], atol=1e-5, rtol=0)
             learner.update(batch)
+
+
+def test_workers_that_die_again_and_again_end_the_run(config: TrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a run that starts a cluster for ever, in which the same worker is killed each time."""
+    started = []
+
+    @module.contextmanager
+    def build_and_die(*_: object, **options: object) -> object:
+        started.append(options["without"])
+        yield
+        raise NodeLostError("one", frozenset({str(len(started))}))
+
+    monkeypatch.setattr(module, "build_collector", build_and_die)
+    monkeypatch.setattr(module._Run, "_iterate", lambda *_: None)
+    with pytest.raises(WorkerError, match="workers died 3 times in a row before an update"):
+        train(config)
+    assert started == [frozenset(), {"1"}, {"1", "2"}]
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import pytest
 
 from cura_torchrl.trainers.config import TrainConfig
 from cura_torchrl.trainers.errors import UnavailableError
+from cura_torchrl.trainers.train import train
 from cura_torchrl.trainers.training import progress as module
 from cura_torchrl.trainers.training.progress import PROGRESS_NAME, Progress, read_progress
 
@@ -65,3 +66,6 @@ def test_a_logger_that_is_not_installed_is_refused_in_one_line(tmp_path: Path, m
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda _: None)
     with pytest.raises(UnavailableError, match=r"logger is 'wandb', which is not installed; accepted: csv"):
         Progress(TrainConfig(run_dir=tmp_path, logger="wandb"), frames=0)
+    with pytest.raises(UnavailableError, match="logger is 'wandb'"):
+        train(TrainConfig(run_dir=tmp_path / "run", logger="wandb", perception="none"))
+    assert not (tmp_path / "run").exists()
