@@ -21,6 +21,7 @@ from cura_torchrl.envs.mdp.observations import observation_size
 from cura_torchrl.envs.push import PushEnv
 from cura_torchrl.envs.robots.robot import ROBOT_MODELS
 from cura_torchrl.envs.transforms import ConfidenceMap, EncodeMap
+from cura_torchrl.envs.transforms.obstacle_code import CODE_SIZE, ObstacleCode
 from cura_torchrl.modules import (
     DistributionalCollisionEstimator,
     MapVAE,
@@ -31,7 +32,6 @@ from cura_torchrl.modules import (
 )
 from cura_torchrl.objectives import CURAAdvantage, CURALoss, PerceptualObjective
 from cura_torchrl.trainers.errors import RunError, UnavailableError
-from cura_torchrl.trainers.training.privileged import CODE_SIZE, ObstacleCode
 from cura_torchrl.trainers.training.ray_backend import RayRollouts, ray_rollouts
 
 if TYPE_CHECKING:

@@ -154,7 +154,7 @@ def _evaluate(arguments: list[str]) -> None:
 def _release(arguments: list[str]) -> None:
     """Write a run's networks as the weights that a method ships with."""
     options = parse(ReleaseOptions, "release", arguments)
-    folder = load_module("cura_torchrl.trainers.loaded_policy").export_policy(options.checkpoint, options.destination)
+    folder = load_module("cura_torchrl.trainers.release").release(options.checkpoint, options.destination)
     sys.stdout.write(f"{folder}\n")
 
 

@@ -359,3 +359,8 @@ class EvaluateConfig:
         for name in ("episodes", "num_workers", "chunk"):
             require(getattr(self, name) > 0, name, getattr(self, name), "1 or more")
         require(0 <= self.seed < 2**31, "seed", self.seed, "0 to 2147483647")
+
+    @property
+    def source(self) -> str | Path:
+        """Trained policy by name or path; there is none for a policy without learning."""
+        return self.checkpoint or self.method or ""

@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 
-from cura_torchrl.trainers.build import SHIPPED_ENCODER, Networks, make_env
+from cura_torchrl.trainers.build import Networks, make_env
 from cura_torchrl.trainers.checkpoint import (
-    file_sha256,
     find_checkpoint,
-    progress_path,
     read_config,
     restore,
-    verify,
     weights_sha256,
-    write_checkpoint,
 )
 from cura_torchrl.trainers.config import TrainConfig
-from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
+from cura_torchrl.trainers.errors import CheckpointError
 from cura_torchrl.trainers.evaluation.task import evaluation_physics, evaluation_task
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.methods import PRESETS
-from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -142,76 +135,6 @@ def load_policy(source: str | Path) -> LoadedPolicy:
         record=record,
         path=path,
     )
-
-
-def export_policy(source: Path, destination: Path | None = None) -> Path:
-    """Write a run's newest networks, without optimisers, as weights are shipped, and its curve beside them.
-
-    Args:
-        source: A run or a checkpoint.
-        destination: Folder to write; None is the package's own folder for the method.
-
-    Returns:
-        The folder that was written.
-
-    Raises:
-        CheckpointError: If there is no checkpoint or it is damaged, or ``destination`` holds anything but weights.
-        UnavailableError: If its encoder is not the one that is shipped: whoever loads it would play with another.
-    """  # noqa: DOC502 - raised by what this calls
-    path = find_checkpoint(source)
-    config, record = read_config(path)
-    folder = SHIPPED_FOLDER / config.method if destination is None else destination
-    _require_replaceable(folder)
-    _require_shipped_encoder(config)
-    networks = Networks(config)
-    restore(path, {"networks": networks})
-    # Paths of the machine that trained say nothing elsewhere.
-    released = config.replace(run_dir=Path("runs") / config.method, encoder=None)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    curve = progress_path(path)
-    if curve.exists():
-        shutil.copyfile(curve, progress_path(folder))
-    else:
-        progress_path(folder).unlink(missing_ok=True)  # that of weights that were there before
-    origin = {name: record[name] for name in ("versions", "commit")}
-    return write_checkpoint({"networks": networks}, released, folder, frames=record["frames"], origin=origin)
-
-
-def _require_replaceable(folder: Path) -> None:
-    """Raise unless nothing but weights is lost when a folder is replaced.
-
-    Raises:
-        CheckpointError: If it is not new, empty, or weights as they were written.
-    """
-    is_named = folder.name not in {"", ".."}  # the curve's name is made of it
-    is_run = folder.parent.name == CHECKPOINT_FOLDER
-    if is_named and not is_run:
-        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-            return
-        with contextlib.suppress(CheckpointError):
-            verify(folder)
-            return
-    msg = f"destination is {folder}; accepted: a folder that is new, empty, or holds released weights and nothing else"
-    raise CheckpointError(msg)
-
-
-def _require_shipped_encoder(config: TrainConfig) -> None:
-    """Raise unless a policy's encoder is the one that comes with the package, at this path or another.
-
-    Raises:
-        UnavailableError: If it is another or not there.
-    """
-    path = config.encoder
-    if path is None or config.perception != "map":
-        return
-    accepted = f"accepted: what the package ships ({SHIPPED_ENCODER.name}), which released weights are loaded with"
-    if not path.is_file():
-        msg = f"encoder is {path}, which is not there to compare; {accepted}"
-        raise UnavailableError(msg)
-    ours, theirs = file_sha256(path), file_sha256(SHIPPED_ENCODER)
-    if ours != theirs:
-        msg = f"encoder is {path}, SHA-256 {ours[:12]}; {accepted}, SHA-256 {theirs[:12]}"
-        raise UnavailableError(msg)
 
 
 def _resolve(source: str | Path) -> Path:

@@ -14,9 +14,9 @@ from tqdm import tqdm
 
 from cura_torchrl.trainers.config import EvaluateConfig
 from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
-from cura_torchrl.trainers.evaluate import Part, parts_of, play_parts
 from cura_torchrl.trainers.evaluation.agreement import agreement, pair
 from cura_torchrl.trainers.evaluation.outcomes import SHIPPED, CodeRecord, OutcomeStore, PolicyRecord, Scenes
+from cura_torchrl.trainers.evaluation.parts import Part, parts_of, play_parts
 from cura_torchrl.trainers.evaluation.table_config import CHUNKS, TableConfig, parse_cell
 from cura_torchrl.trainers.evaluation.table_figure import table_figure
 from cura_torchrl.trainers.evaluation.table_numbers import Result, compare

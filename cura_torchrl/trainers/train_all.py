@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import operator
 import os
 import re
 import shlex
@@ -15,7 +16,7 @@ from collections import Counter, deque
 from typing import TYPE_CHECKING, Any
 
 from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, weights_sha256
-from cura_torchrl.trainers.decoding import changed_fields, encode
+from cura_torchrl.trainers.decoding import changed_fields
 from cura_torchrl.trainers.errors import CheckpointError, Interrupted
 from cura_torchrl.trainers.info import hardware
 from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER, is_locked
@@ -290,20 +291,11 @@ def _is_done(run: PlannedRun) -> bool:
     return source is not None and read_config(source)[1]["frames"] >= run.config.total_frames
 
 
-def _flat(data: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in data.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
-
-
 def _machine_flags(config: TrainConfig) -> Iterator[str]:
-    values = dict(_flat(encode(config)))
     for field in MACHINE_FIELDS:
         parent, _, name = field.replace("_", "-").rpartition(".")
         prefix = f"--{parent}." if parent else "--"
-        value = values[field]
+        value = operator.attrgetter(field)(config)
         if isinstance(value, bool):
             yield prefix + (name if value else f"no-{name}")
         else:

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cura_torchrl.trainers.calibration.config import CONDITIONS
-from cura_torchrl.trainers.pictures.scene_axes import encode
+from cura_torchrl.trainers.pictures.axes import encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cura_torchrl.trainers.pictures import raster
-from cura_torchrl.trainers.pictures.scene_axes import encode, tidy
+from cura_torchrl.trainers.pictures.axes import encode, tidy
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

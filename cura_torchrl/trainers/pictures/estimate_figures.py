@@ -11,17 +11,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
 from cura_torchrl.trainers.pictures import raster
+from cura_torchrl.trainers.pictures.axes import encode, set_margins, tidy
 from cura_torchrl.trainers.pictures.moments import Appearance, find_appearance, frames_at
 from cura_torchrl.trainers.pictures.raster import rectangle_corners, three_digits
-from cura_torchrl.trainers.pictures.scene_axes import (
-    draw_map,
-    draw_scan,
-    encode,
-    outline,
-    place_in_base,
-    set_margins,
-    tidy,
-)
+from cura_torchrl.trainers.pictures.scene_axes import draw_map, draw_scan, outline, place_in_base
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -14,6 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from cura_torchrl.envs.robots.ridgeback_franka import HOME_TCP
 from cura_torchrl.trainers.pictures import raster
+from cura_torchrl.trainers.pictures.axes import encode, set_margins, tidy
 from cura_torchrl.trainers.pictures.moments import frames_at
 from cura_torchrl.trainers.pictures.raster import rectangle_corners
 from cura_torchrl.trainers.pictures.scene_axes import (
@@ -21,11 +22,8 @@ from cura_torchrl.trainers.pictures.scene_axes import (
     draw_map,
     draw_paths,
     draw_robot,
-    encode,
     frame_world,
     outline,
-    set_margins,
-    tidy,
     write,
 )
 

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import io
 from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 import numpy as np
 import torch
 from matplotlib.colors import ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
 from matplotlib.patheffects import withStroke
-from PIL import Image
 
 from cura_torchrl.envs import geometry
 from cura_torchrl.envs.robots.ridgeback import CHASSIS_SIZE
 from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.trainers.pictures import raster
+from cura_torchrl.trainers.pictures.axes import tidy
 from cura_torchrl.trainers.pictures.raster import SCENE_X, SCENE_Y, rectangle_corners
 
 if TYPE_CHECKING:
@@ -25,13 +23,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from cura_torchrl.trainers.pictures.recording import Recording
-    from cura_torchrl.trainers.pictures.render_config import StillFormat
 
 _MARGIN = 0.25
 """Left between what is drawn and the frame, where that is beyond the usual limits [m]."""
 _MAP_TICKS = (-4, -2, 0, 2, 4)
-_DOTS = 140
-"""Resolution of the pictures [pixel/inch]."""
 _POSE_TIME = 5.0
 """Time between two outlines along a path [s]."""
 
@@ -227,55 +222,3 @@ def frame_world(axis: Any) -> None:
     axis.set(xlim=x, ylim=y, aspect="equal", xlabel="x [m]")
     axis.set_xticks(range(-2, 17, 2))
     tidy(axis)
-
-
-def tidy(axis: Any) -> None:
-    """Draw a faint grid and no frame.
-
-    Args:
-        axis: Where to draw.
-    """
-    axis.grid(color=raster.GRID, linewidth=0.6)
-    axis.set_axisbelow(True)
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.tick_params(labelsize=9)
-
-
-def set_margins(
-    figure: Figure, *, left: float = 0.6, right: float = 0.15, top: float = 0.35, bottom: float = 0.55
-) -> None:
-    """Set the margins; matplotlib's automatic layout takes longer than all the rest of a figure.
-
-    Args:
-        figure: The figure.
-        left: Margin on the left [inch].
-        right: Margin on the right [inch].
-        top: Margin above [inch].
-        bottom: Margin below [inch].
-    """
-    width, height = figure.get_size_inches()
-    figure.subplots_adjust(left / width, bottom / height, 1 - right / width, 1 - top / height)
-
-
-def encode(figure: Figure, kind: StillFormat) -> bytes:
-    """Return a figure as a file.
-
-    Args:
-        figure: The figure.
-        kind: Format of the file.
-
-    Returns:
-        Content of the file; the same figure gives the same.
-    """
-    drawn = io.BytesIO()
-    if kind == "svg":
-        # Nothing is there by chance: neither a date nor names of parts.
-        with mpl.rc_context({"svg.hashsalt": "figure"}):
-            figure.savefig(drawn, format="svg", facecolor="white", metadata={"Date": None})
-        return drawn.getvalue()
-    figure.savefig(drawn, format="png", dpi=_DOTS, facecolor="white")
-    # A palette of 256 colours makes a third of the size.
-    image = Image.open(drawn).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    packed = io.BytesIO()
-    image.save(packed, "PNG", optimize=True)
-    return packed.getvalue()

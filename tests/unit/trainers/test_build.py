@@ -11,13 +11,13 @@ import torch
 from tensordict import TensorDict
 
 from cura_torchrl.envs.config import MapConfig
+from cura_torchrl.envs.transforms.obstacle_code import CODE_SIZE, ObstacleCode
 from cura_torchrl.modules import MapVAE
 from cura_torchrl.trainers import build as module
 from cura_torchrl.trainers.build import LATENT_SIZE, Networks, load_encoder, make_env, make_worker_env
 from cura_torchrl.trainers.errors import RunError, UnavailableError
 from cura_torchrl.trainers.methods import method
 from cura_torchrl.trainers.train import train
-from cura_torchrl.trainers.training.privileged import CODE_SIZE, ObstacleCode
 
 if TYPE_CHECKING:
     from pathlib import Path

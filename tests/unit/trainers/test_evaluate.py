@@ -23,8 +23,10 @@ from cura_torchrl.trainers import evaluate as module
 from cura_torchrl.trainers.build import Networks, make_env
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, find_checkpoint, read_config, save_checkpoint
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
-from cura_torchrl.trainers.evaluate import Part, Player, evaluate
+from cura_torchrl.trainers.evaluate import evaluate
+from cura_torchrl.trainers.evaluation import parts
 from cura_torchrl.trainers.evaluation.episodes import Episode, play_episodes, summarise
+from cura_torchrl.trainers.evaluation.parts import Part, Player
 from cura_torchrl.trainers.evaluation.task import evaluation_physics, evaluation_task
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.loaded_policy import SHIPPED_FOLDER
@@ -211,18 +213,18 @@ def test_what_is_played_is_the_checkpoint_that_the_result_names(
 ) -> None:
     """Catches workers that load what a run that is being trained has written since."""
     run = tiny_run("push", tmp_path)
-    first, parts = find_checkpoint(run), []
+    first, seen = find_checkpoint(run), []
     config, _ = read_config(first)
 
     def train_on(played: list[Part], *_: object, **options: Callable[..., object]) -> None:
         save_checkpoint({"networks": Networks(config)}, config, run / CHECKPOINT_FOLDER, frames=9000)
-        parts.extend(played)
+        seen.extend(played)
         options["keep"](played[0], [episode(0)])
 
     monkeypatch.setattr(module, "play_parts", train_on)
     result = evaluate(EvaluateConfig(checkpoint=run, episodes=1))
     assert result["checkpoint"] == first.as_posix()
-    assert [part.config.checkpoint for part in parts] == [first]
+    assert [part.config.checkpoint for part in seen] == [first]
 
 
 @pytest.mark.slow
@@ -248,9 +250,9 @@ def test_a_worker_closes_the_worlds_of_the_cell_before(monkeypatch: pytest.Monke
     monkeypatch.setattr(module, "Player", Watched)
     for size, worlds in ((0.5, 1), (0.5, 1), (1.0, 2)):
         config = EvaluateConfig(policy="scripted", object_size=size, simulator="planar", chunk=1, episodes=1)
-        player = module._worker_player(config)
+        player = parts._worker_player(config)
         assert player is made[-1]
         assert len(made) == worlds
     assert closed == made[:1]
     made[-1].close()
-    module._players.clear()
+    parts._players.clear()

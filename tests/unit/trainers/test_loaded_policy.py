@@ -15,8 +15,9 @@ from cura_torchrl.trainers import checkpoint, loaded_policy
 from cura_torchrl.trainers.build import SHIPPED_ENCODER, Networks
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, read_config, save_checkpoint, verify
 from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
-from cura_torchrl.trainers.loaded_policy import export_policy, load_policy
+from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.methods import method
+from cura_torchrl.trainers.release import release
 from cura_torchrl.trainers.training.progress import PROGRESS_NAME
 
 
@@ -27,12 +28,12 @@ def test_exported_weights_say_what_trained_them(tmp_path: Path, monkeypatch: pyt
     save_checkpoint({"networks": Networks(config)}, config, tmp_path / "run" / CHECKPOINT_FOLDER, frames=7)
     (tmp_path / "run" / PROGRESS_NAME).write_text("frames\n7\n", encoding="utf-8")
     monkeypatch.setattr(checkpoint, "git_commit", lambda: "of the release")
-    released = export_policy(tmp_path / "run", tmp_path / "release" / "push")
+    released = release(tmp_path / "run", tmp_path / "release" / "push")
     assert read_config(released)[1]["commit"] == "of the training"
     curve = tmp_path / "release" / f"push-{PROGRESS_NAME}"
     assert curve.read_text(encoding="utf-8") == "frames\n7\n"
     (tmp_path / "run" / PROGRESS_NAME).unlink()
-    export_policy(tmp_path / "run", released)
+    release(tmp_path / "run", released)
     assert not curve.exists()  # it would be that of other weights
 
 
@@ -42,7 +43,7 @@ def test_exported_weights_load_by_path_and_act_alike(tmp_path: Path) -> None:
     networks = Networks(config)
     networks.observation_norm.update(torch.randn(50, networks.observation_norm.mean.shape[0]) * 3 + 1)
     save_checkpoint({"networks": networks, "counters": nn.Linear(1, 1)}, config, tmp_path / "run", frames=7)
-    loaded = load_policy(export_policy(tmp_path / "run", tmp_path / "release" / "push"))
+    loaded = load_policy(release(tmp_path / "run", tmp_path / "release" / "push"))
     inputs = {"observation": torch.randn(4, 33), "latent": torch.randn(4, 32)}
     for ours, theirs in (
         (networks.actor.module[0], loaded.policy.module[0]),
@@ -65,7 +66,7 @@ def test_a_release_leaves_folders_alone_that_hold_anything_else(tmp_path: Path, 
     file.parent.mkdir(parents=True)
     file.write_text("mine", encoding="utf-8")
     with pytest.raises(CheckpointError, match=r"destination is .*mine; accepted: a folder that is new, empty, or"):
-        export_policy(run, destination)
+        release(run, destination)
     assert file.read_text(encoding="utf-8") == "mine"
 
 
@@ -74,15 +75,15 @@ def test_a_release_replaces_weights_but_not_what_was_put_beside_them(tmp_path: P
     run, destination = _tiny_release(tmp_path), tmp_path / "weights" / "push"
     destination.mkdir(parents=True)
     for _ in range(2):
-        assert export_policy(run, destination) == destination
+        assert release(run, destination) == destination
     verify(destination)
     (destination / "notes.txt").write_text("mine", encoding="utf-8")
     with pytest.raises(CheckpointError, match="destination is"):
-        export_policy(run, destination)
+        release(run, destination)
     with pytest.raises(CheckpointError, match="destination is"):
-        export_policy(run, next((run / CHECKPOINT_FOLDER).iterdir()))
+        release(run, next((run / CHECKPOINT_FOLDER).iterdir()))
     with pytest.raises(CheckpointError, match="destination is"):
-        export_policy(run, Path())
+        release(run, Path())
 
 
 @pytest.mark.parametrize(
@@ -93,7 +94,7 @@ def test_a_release_with_another_encoder_is_refused(tmp_path: Path, name: str, me
     MapVAE().save(tmp_path / "other.pt")
     run = _tiny_release(tmp_path, perception="map", encoder=tmp_path / name)
     with pytest.raises(UnavailableError, match=f"encoder is .*{name}, .*{message}"):
-        export_policy(run, tmp_path / "push")
+        release(run, tmp_path / "push")
     assert not (tmp_path / "push").exists()
 
 
@@ -101,7 +102,7 @@ def test_a_release_with_a_copy_of_the_shipped_encoder_forgets_its_path(tmp_path:
     """Catches a comparison of paths: shipped weights were trained with the file before it came to the package."""
     copy = shutil.copyfile(SHIPPED_ENCODER, tmp_path / "map_vae.pt")
     run = _tiny_release(tmp_path, perception="map", encoder=copy)
-    assert read_config(export_policy(run, tmp_path / "push"))[0].encoder is None
+    assert read_config(release(run, tmp_path / "push"))[0].encoder is None
 
 
 def _tiny_release(folder: Path, **changes: Any) -> Path:

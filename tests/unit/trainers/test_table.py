@@ -22,10 +22,10 @@ import torch
 from cura_torchrl.trainers.build import Networks
 from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
 from cura_torchrl.trainers.errors import CheckpointError, RunError, UnavailableError
-from cura_torchrl.trainers.evaluate import BATCHES, Part, Player
 from cura_torchrl.trainers.evaluation.measures import Measures
 from cura_torchrl.trainers.evaluation.outcomes import PolicyRecord
 from cura_torchrl.trainers.evaluation.paper_table import PAPER_CELLS, PAPER_SUCCESS, paper_success
+from cura_torchrl.trainers.evaluation.parts import BATCHES, Part, Player
 from cura_torchrl.trainers.evaluation.table_config import TableConfig
 from cura_torchrl.trainers.evaluation.table_figure import table_figure
 from cura_torchrl.trainers.evaluation.table_numbers import compare
@@ -131,10 +131,10 @@ def shorten_episodes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the processes that are started, and theirs, play episodes of one second, in parts of five for each world."""
     patch = """import functools
 from cura_torchrl.envs.config import TaskConfig
-from cura_torchrl.trainers import evaluate
+from cura_torchrl.trainers.evaluation import parts
 from cura_torchrl.trainers.evaluation import task as evaluation_task
 evaluation_task.TaskConfig = functools.partial(TaskConfig, episode_time=1.0)
-evaluate.BATCHES["planar"] = 5
+parts.BATCHES["planar"] = 5
 """
     folder.mkdir()
     (folder / "sitecustomize.py").write_text(patch, encoding="utf-8")

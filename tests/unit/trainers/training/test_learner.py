@@ -12,12 +12,12 @@ from tensordict import TensorDict
 from torch.distributions import Independent, Normal, kl_divergence
 
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SIZE
+from cura_torchrl.envs.transforms.obstacle_code import CODE_SIZE
 from cura_torchrl.trainers.build import LATENT_SIZE, Networks
 from cura_torchrl.trainers.config import PPOConfig, TrainConfig
 from cura_torchrl.trainers.errors import NonFiniteError
 from cura_torchrl.trainers.methods import method
 from cura_torchrl.trainers.training.learner import Learner, adapted_rate, gaussian_divergence
-from cura_torchrl.trainers.training.privileged import CODE_SIZE
 
 ROWS, STEPS = 4, 16
 
