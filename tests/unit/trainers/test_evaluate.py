@@ -247,7 +247,7 @@ def test_a_worker_closes_the_worlds_of_the_cell_before(monkeypatch: pytest.Monke
             super().close()
             closed.append(self)
 
-    monkeypatch.setattr(module, "Player", Watched)
+    monkeypatch.setattr(parts, "Player", Watched)
     for size, worlds in ((0.5, 1), (0.5, 1), (1.0, 2)):
         config = EvaluateConfig(policy="scripted", object_size=size, simulator="planar", chunk=1, episodes=1)
         player = parts._worker_player(config)
