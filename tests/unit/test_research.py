@@ -5,10 +5,16 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
 from tensordict import TensorDict
+
+from cura_torchrl.trainers.loaded_policy import load_policy
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 Load = Callable[[str], ModuleType]
 
@@ -49,3 +55,15 @@ def test_costs_are_summed_over_the_steps_before_a_collision(load: Load) -> None:
     assert ends.tolist() == [[0, 24]]
     values = torch.arange(30.0)[None].numpy()
     assert crash.window_sums(values, ends - [0, 10]).tolist() == [sum(range(14, 24))]
+
+
+def test_an_estimator_with_more_atoms_predicts_the_same(load: Load, tmp_path: Path) -> None:
+    """Catches atoms that are dealt out in another order, and a part of the networks that is lost."""
+    before = load_policy("cura-ppo")
+    after = load_policy(load("more_atoms").widen("cura-ppo", 3, tmp_path / "wide"))
+    state = TensorDict(observation=torch.randn(5, 33), latent=torch.randn(5, 32), batch_size=[5])
+    old, new = (loaded.collision_estimator(state.clone())["collision_atoms"] for loaded in (before, after))
+    assert (after.config.cura.num_atoms, new.shape) == (150, (5, 150))
+    assert (new - old.repeat_interleave(3, dim=-1)).abs().max() < 0.1
+    assert new.unique().numel() > old.unique().numel()
+    assert torch.equal(*(loaded.critic(state.clone())["state_value"] for loaded in (before, after)))
