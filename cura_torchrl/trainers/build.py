@@ -5,16 +5,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 import signal
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.collectors import Collector
 from torchrl.envs import Compose, TransformedEnv
-from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from cura_torchrl import keys
 from cura_torchrl.envs.mdp.observations import observation_size
@@ -32,6 +30,7 @@ from cura_torchrl.modules import (
 )
 from cura_torchrl.objectives import CURAAdvantage, CURALoss, PerceptualObjective
 from cura_torchrl.trainers.errors import RunError, UnavailableError
+from cura_torchrl.trainers.training.local_collector import local_collector
 from cura_torchrl.trainers.training.ray_backend import RayRollouts, ray_rollouts
 
 if TYPE_CHECKING:
@@ -337,27 +336,13 @@ def build_collector(
     make_env = functools.partial(make_worker_env, config, frames_done=frames_done)
     share = config.num_envs // config.num_workers
     factories = [functools.partial(make_env, share, worker=worker) for worker in range(config.num_workers)]
-    options: dict[str, Any] = {
-        "frames_per_batch": config.frames_per_batch,
-        "total_frames": -1,
-        "auto_register_policy_transforms": False,
-        "use_buffers": True,
-    }
     if config.perception == "map":
         fitting_encoder(config)  # what is wrong with it is told here, and not by each worker
-    with ExitStack() as stack:
-        if config.backend == "ray":
-            yield stack.enter_context(ray_rollouts(config, make_env, policy, without=without))
-            return
-        if config.num_workers == 1:
-            collector = Collector(factories[0], policy, **options)
-        else:
-            scheme = SharedMemWeightSyncScheme()
-            # Left to the end of the process it would start a thread there, and the process would never end.
-            stack.callback(scheme.shutdown)
-            processes = {"sync": True, "backend": "process", "backend_options": {"cat_results": 0}}
-            collector = Collector(factories, policy, weight_sync_schemes={"policy": scheme}, **processes, **options)
-        stack.callback(collector.shutdown)
+    if config.backend == "ray":
+        with ray_rollouts(config, make_env, policy, without=without) as rollouts:
+            yield rollouts
+        return
+    with local_collector(factories, policy, config.frames_per_batch) as collector:
         # TorchRL takes a thread from the learner for every worker; they never run at the same time here.
         torch.set_num_threads(config.learner_threads)
         yield collector

@@ -14,18 +14,17 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch.nn import functional as F  # noqa: N812
-from torchrl.collectors import Collector
 from torchrl.data import Composite, UnboundedDiscrete
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.transforms import ObservationTransform
-from torchrl.weight_update import SharedMemWeightSyncScheme
 from tqdm import tqdm
 
 from cura_torchrl import keys
 from cura_torchrl.envs.robots.scripted import ScriptedAvoider, ScriptedPusher
+from cura_torchrl.trainers.training.local_collector import local_collector
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from tensordict import TensorDictBase
@@ -261,8 +260,12 @@ def collect_maps(
     factories = [
         functools.partial(_make_worker_env, make_env, make_transform, worker, seed) for worker in range(num_workers)
     ]
-    with tqdm(total=num_maps, desc="collect", unit="map") as bar:
-        for batch in _batches(factories, policy, num_workers * num_envs * 8 * keep_every):
+    frames = num_workers * num_envs * 8 * keep_every
+    with (
+        tqdm(total=num_maps, desc="collect", unit="map") as bar,
+        local_collector(factories, policy, frames) as collector,
+    ):
+        for batch in collector:
             codes.append(batch[CODES][:, ::keep_every].flatten(0, 1).clone())
             episodes.append(batch[keys.EPISODE][:, ::keep_every].flatten().clone())
             count += len(codes[-1])
@@ -278,35 +281,3 @@ def _make_worker_env(
     torch.set_num_threads(1)
     torch.manual_seed(seed + 7919 * worker)
     return TransformedEnv(make_env(worker), Compose(make_transform(), PackMaps()))
-
-
-def _batches(
-    factories: list[functools.partial[EnvBase]], policy: TensorDictModuleBase, frames: int
-) -> Iterator[TensorDictBase]:
-    # Batches of this many frames, shape ``[rows of all workers, T]``, until the generator is closed.
-    options = {
-        "frames_per_batch": frames,
-        "total_frames": -1,
-        "auto_register_policy_transforms": False,
-        "use_buffers": True,
-    }
-    if len(factories) == 1:
-        collector, scheme = Collector(factories[0], policy, **options), None
-    else:
-        scheme = SharedMemWeightSyncScheme()
-        collector = Collector(
-            factories,
-            policy,
-            sync=True,
-            backend="process",
-            backend_options={"cat_results": 0},
-            weight_sync_schemes={"policy": scheme},
-            **options,
-        )
-    try:
-        yield from collector
-    finally:
-        collector.shutdown()
-        if scheme is not None:
-            # Left to the end of the process it would start a thread there, and the process would never end.
-            scheme.shutdown()
