@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from cura_torchrl.trainers.build import Networks
-from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, restore, write_checkpoint
+from cura_torchrl.trainers.checkpoint import restore, write_checkpoint
 from cura_torchrl.trainers.loaded_policy import load_policy
 
 NOISE = 1e-3
@@ -31,10 +31,10 @@ def widen(checkpoint: str, copies: int, output: Path) -> Path:
     Returns:
         The folder.
     """
-    path = find_checkpoint(load_policy(checkpoint).path)
-    config, record = read_config(path)
+    loaded = load_policy(checkpoint)
+    config, record = loaded.config, loaded.record
     old = Networks(config)
-    restore(path, {"networks": old})
+    restore(loaded.path, {"networks": old})
     wide = config.replace(cura=dataclasses.replace(config.cura, num_atoms=copies * config.cura.num_atoms))
     new = Networks(wide)
     weights, shapes = old.state_dict(), new.state_dict()

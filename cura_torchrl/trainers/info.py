@@ -28,9 +28,8 @@ PACKAGES = (
 """Distributions whose versions are recorded beside every checkpoint and result."""
 
 
-@functools.cache
 def versions() -> dict[str, str]:
-    """Return the versions that a result depends on, those that were found when it was asked first.
+    """Return the versions that a result depends on.
 
     Returns:
         Version by distribution, with Python's own; "not installed" where there is none.
