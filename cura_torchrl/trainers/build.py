@@ -253,7 +253,13 @@ def fitting_encoder(config: TrainConfig) -> MapVAE:
 
 
 def make_env(
-    config: TrainConfig, num_envs: int, *, keep_map: bool = False, add_obstacle_code: bool = False, **options: Any
+    config: TrainConfig,
+    num_envs: int,
+    *,
+    keep_map: bool = False,
+    add_obstacle_code: bool = False,
+    dtype: torch.dtype = torch.float32,
+    **options: Any,
 ) -> TransformedEnv:
     """Return the environment with what the policy sees of it.
 
@@ -262,6 +268,7 @@ def make_env(
         num_envs: Number of worlds N.
         keep_map: Whether the window of the map stays in the tensordict under ``confidence_map``.
         add_obstacle_code: Whether the true obstacles are emitted as ``obstacle_code``, for a privileged estimator.
+        dtype: Precision in which maps are encoded.
         **options: Keyword arguments of :class:`~cura_torchrl.envs.push.PushEnv`.
 
     Returns:
@@ -274,7 +281,7 @@ def make_env(
     if config.perception == "map" or keep_map:
         transforms.append(ConfidenceMap(config.map, num_rays=lidar.num_rays, max_range=lidar.max_range))
     if config.perception == "map":
-        transforms.append(EncodeMap(fitting_encoder(config), del_keys=not keep_map))
+        transforms.append(EncodeMap(fitting_encoder(config).to(dtype), del_keys=not keep_map))
     else:
         transforms.append(ObstacleCode(LATENT_SIZE, is_blind=config.perception == "none"))
     if add_obstacle_code:

@@ -55,7 +55,7 @@ def calibrate(config: CalibrateConfig) -> str:
         CheckpointError: If a policy's checkpoint is missing or damaged.
         RunError: If a policy sees no map, or no draw of hidden obstacles agrees with what was seen.
     """  # noqa: DOC502 - raised by what this calls
-    policies = {name: load_policy(name) for name in config.methods}
+    policies = {name: load_policy(name).double() for name in config.methods}
     blind = [name for name, loaded in policies.items() if loaded.config.perception != "map"]
     if blind:
         msg = f"method is {blind[0]}, which sees no map; accepted: a policy that sees one"

@@ -220,7 +220,7 @@ def _play_one(
     config: DemoConfig, path: Path, task: TaskConfig, scenes: list[Scene], label: str, report: Callable[[int], object]
 ) -> list[Recording]:
     """Return the recordings of one policy; the scenes run side by side."""
-    loaded = load_policy(path)
+    loaded = load_policy(path).double()
     env = loaded.make_env(
         len(scenes),
         task=task,

@@ -54,6 +54,19 @@ class LoadedPolicy:
         """SHA-256 that tells these weights from others."""
         return weights_sha256(self.path)
 
+    def double(self) -> LoadedPolicy:
+        """Let networks, and encoders of environments that are made from now on, compute in float64, in place.
+
+        Float32 rounds differently on another processor and in batches of another size; over an episode that grows
+        until one scene in fifty ends in another way. Evaluations compute in float64.
+
+        Returns:
+            The same policy.
+        """
+        for network in (self.policy, self.critic, self.collision_estimator):
+            network.double()
+        return self
+
     def make_env(
         self,
         num_envs: int,
@@ -83,7 +96,8 @@ class LoadedPolicy:
         trained = self.config.env
         env = dataclasses.replace(trained, task=played, physics=physics or trained.physics, simulator=where)
         config = self.config.replace(env=env, simulator=where)
-        return make_env(config, num_envs, keep_map=keep_map, **options)
+        dtype = next(self.policy.parameters()).dtype
+        return make_env(config, num_envs, keep_map=keep_map, dtype=dtype, **options)
 
     def make_evaluation_env(
         self, num_envs: int, scenes: SceneChoice, *, simulator: Simulator | None = None, keep_map: bool = False

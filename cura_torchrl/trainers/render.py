@@ -52,7 +52,7 @@ def render(config: RenderConfig) -> list[Path]:
     """  # noqa: DOC502 - raised by what this calls
     for kind in config.animation_formats:
         require_format(kind)
-    loaded = [load_policy(name) for name in config.methods]
+    loaded = [load_policy(name).double() for name in config.methods]
     recordings = play_scene(config, loaded)
     for recording in recordings:
         logger.info("scene %d, %s: %s", config.scene, recording.label, recording.describe())

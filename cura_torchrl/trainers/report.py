@@ -103,9 +103,9 @@ def report(config: ReportConfig) -> Path:
 def _load_runs(config: ReportConfig) -> list[Run]:
     """Return the runs, and last the baseline, unless it is one of them."""
     sources = list(dict.fromkeys(config.runs))
-    loaded = [load_policy(source) for source in sources]
+    loaded = [load_policy(source).double() for source in sources]
     if config.baseline is not None:
-        baseline = load_policy(config.baseline)
+        baseline = load_policy(config.baseline).double()
         if baseline.path not in [policy.path for policy in loaded]:
             sources.append(config.baseline)
             loaded.append(baseline)

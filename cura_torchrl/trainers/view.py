@@ -167,7 +167,7 @@ def view(config: ViewConfig, *, scenes: int | None = None) -> None:
     """  # noqa: DOC502 - raised by what this calls
     shown = View(config)
     with closing(shown), one_thread():
-        loaded = load_policy(config.method)
+        loaded = load_policy(config.method).double()
         logger.info("open http://%s:%d in a browser; Ctrl-C ends the view", config.host, shown.server.get_port())
         while scenes is None or scenes > 0:
             play_scene(config, loaded, shown)

@@ -15,14 +15,19 @@ from cura_torchrl.envs.transforms.reset_mask import reset_mask
 if TYPE_CHECKING:
     from tensordict import NestedKey
 
+_ROWS = 32
+"""Maps that the CPU encodes at a time [1]: what is between the layers stays in its cache. In float64 250 maps so take
+46 ms in place of 133."""
+
 
 class EncodeMap(Transform):
     """Encode maps with a frozen network.
 
     Encoding in the environment rather than in the policy gives the codes at the root and under ``"next"`` for one pass
     a step. The network's parameters are frozen, it stays in evaluation mode whatever the mode of the environment, and
-    no gradient is recorded. A partial reset encodes only the rows that are reset; the other rows' codes are 0 in what
-    ``_reset`` returns, for TorchRL keeps their old value. Codes depend on the batch by rounding only (about 1e-5).
+    no gradient is recorded. Maps become what the encoder's parameters are, so that ``encoder.double()`` writes codes in
+    float64. A partial reset encodes only the rows that are reset; the other rows' codes are 0 in what ``_reset``
+    returns, for TorchRL keeps their old value. Codes depend on the batch by rounding only (in float32 about 1e-5).
 
     ================== ======= ================================================ ================
     Key (default)      Access  Content                                          Shape
@@ -123,7 +128,9 @@ class EncodeMap(Transform):
 
     @torch.no_grad()
     def _encode(self, maps: torch.Tensor) -> torch.Tensor:
-        return self.encoder(maps)
+        dtype = next((parameter.dtype for parameter in self.encoder.parameters()), maps.dtype)
+        rows = _ROWS if maps.device.type == "cpu" else max(1, len(maps))
+        return torch.cat([self.encoder(piece.to(dtype)) for piece in maps.split(rows)])
 
     def _read(self, tensordict: TensorDictBase) -> torch.Tensor:
         maps = tensordict.get(self.in_keys[0])

@@ -154,7 +154,7 @@ def _worker_player(config: EvaluateConfig) -> Player:
 def _build(config: EvaluateConfig) -> tuple[EnvBase, Callable[[TensorDictBase], TensorDictBase]]:
     """Return the worlds and who plays in them."""
     if config.policy is None:
-        loaded = load_policy(config.source)
+        loaded = load_policy(config.source).double()
         return loaded.make_evaluation_env(config.chunk, config, simulator=config.simulator), loaded.policy
     base = PushEnvConfig(simulator=config.simulator, robot=RobotConfig(model=config.robot))
     env = PushEnv(config.chunk, dataclasses.replace(base, task=evaluation_task(base.task, config)), seed=config.seed)

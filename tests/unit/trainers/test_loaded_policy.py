@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cura_torchrl.modules import MapVAE
 from cura_torchrl.trainers import checkpoint, loaded_policy
@@ -121,6 +123,27 @@ def test_a_policy_plays_on_either_simulator_whatever_it_was_trained_on(tmp_path:
         assert env.base_env.config.simulator == played
         assert env.base_env.config.task.stream == "eval"
         env.close()
+
+
+def test_in_float64_an_episode_hardly_depends_on_how_many_are_played_side_by_side() -> None:
+    """Catches an encoder, normaliser or actor left in float32: it rounds differently in another batch."""
+
+    def actions(worlds: int, *, wide: bool) -> torch.Tensor:
+        loaded = load_policy("cura-ppo")
+        loaded = loaded.double() if wide else loaded
+        with (
+            closing(loaded.make_env(worlds, simulator="planar", seed=0)) as env,
+            torch.no_grad(),
+            set_exploration_type(ExplorationType.DETERMINISTIC),
+        ):
+            return env.rollout(15, loaded.policy, break_when_any_done=False)["action"][0].double()
+
+    def error(*, wide: bool) -> float:
+        return float((actions(1, wide=wide) - actions(33, wide=wide)).abs().max())
+
+    # 33 is more than a piece of maps.
+    assert error(wide=True) < 1e-12
+    assert error(wide=False) > 1e-8  # the batch does matter: else nothing is tested
 
 
 @pytest.mark.parametrize("name", ["cura-cvar", "cura-perceptual"])

@@ -53,6 +53,21 @@ class TestContract(TransformContract):
 class TestEncoder:
     """What is encoded, when, and how."""
 
+    def test_writes_codes_in_the_encoders_precision(self) -> None:
+        """Catches maps that a network in float64 refuses, and a spec that is not what is written."""
+        env = make_env(encoder=CountingEncoder().double())
+        codes = env.rollout(2)["latent"]
+        assert codes.dtype == env.observation_spec["latent"].dtype == torch.float64
+
+    def test_encodes_every_row_of_a_large_batch_at_its_place(self) -> None:
+        """Catches pieces that are lost, swapped or overlap; 100 is no multiple of a piece."""
+        encoder, maps = CountingEncoder(), torch.rand(10, 10, 2, 20, 20)
+        codes = EncodeMap(encoder)(TensorDict(confidence_map=maps, batch_size=[10, 10]))["latent"]
+        assert sum(encoder.counts) == 100
+        assert max(encoder.counts) < 100
+        expected = maps.flatten(2) @ encoder.layers[1].weight.T + encoder.layers[1].bias
+        torch.testing.assert_close(codes, expected)
+
     def test_stays_frozen_and_in_evaluation_mode(self) -> None:
         """Catches dropout that turns on with env.train(), and an optimiser that could reach the weights."""
         encoder = CountingEncoder().train()
