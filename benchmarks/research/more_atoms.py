@@ -13,8 +13,8 @@ from pathlib import Path
 import torch
 
 from cura_torchrl.trainers.build import Networks
-from cura_torchrl.trainers.checkpoint import restore, write_checkpoint
-from cura_torchrl.trainers.loaded_policy import load_policy
+from cura_torchrl.trainers.checkpoint import write_checkpoint
+from cura_torchrl.trainers.loaded_policy import load_policy, read_networks
 
 NOISE = 1e-3
 """Standard deviation of the noise on copied weights, without which copies would stay copies [1]."""
@@ -33,11 +33,9 @@ def widen(checkpoint: str, copies: int, output: Path) -> Path:
     """
     loaded = load_policy(checkpoint)
     config, record = loaded.config, loaded.record
-    old = Networks(config)
-    restore(loaded.path, {"networks": old})
     wide = config.replace(cura=dataclasses.replace(config.cura, num_atoms=copies * config.cura.num_atoms))
     new = Networks(wide)
-    weights, shapes = old.state_dict(), new.state_dict()
+    weights, shapes = read_networks(loaded.path, config).state_dict(), new.state_dict()
     generator = torch.Generator().manual_seed(0)
     for name, value in weights.items():
         if shapes[name].shape != value.shape:

@@ -28,6 +28,8 @@ from cura_torchrl.trainers.pages.demo_config import DemoConfig
 from cura_torchrl.trainers.pages.report_config import ReportConfig
 from cura_torchrl.trainers.pictures.render_config import RenderConfig
 from cura_torchrl.trainers.pictures.view_config import ViewConfig
+from cura_torchrl.trainers.training.imitate_config import ImitateConfig
+from cura_torchrl.trainers.training.pretrain_map_config import PretrainMapConfig
 from cura_torchrl.trainers.training.train_all_config import PlannedRun, TrainAllConfig
 
 if TYPE_CHECKING:
@@ -190,18 +192,14 @@ def _info(arguments: list[str]) -> None:
 
 def _pretrain_map(arguments: list[str]) -> None:
     """Train the encoder of confidence maps."""
-    module = load_module("cura_torchrl.trainers.pretrain_map")
-    config = parse(module.PretrainMapConfig, "pretrain-map", arguments)
-    with clean_stdout():
-        module.pretrain_map(config)
+    config = parse(PretrainMapConfig, "pretrain-map", arguments)
+    _run("pretrain_map", config)
 
 
 def _imitate(arguments: list[str]) -> None:
     """Warm-start the networks of a method by imitating a scripted pusher."""
-    module = load_module("cura_torchrl.trainers.imitate")
-    config = parse(module.ImitateConfig, "imitate", arguments)
-    with clean_stdout():
-        checkpoint = module.imitate(config)
+    config = parse(ImitateConfig, "imitate", arguments)
+    checkpoint = _run("imitate", config)
     sys.stdout.write(f"{checkpoint}\n")
 
 

@@ -343,8 +343,7 @@ class EvaluateConfig:
     num_workers: int = 1
     """Processes that play [1]; results do not depend on it."""
     chunk: int = 20
-    """Episodes that a process plays side by side [1]; networks round differently in batches of another size, so keep it
-    to compare."""
+    """Episodes that a process plays side by side [1]."""
 
     def __post_init__(self) -> None:
         require_finite(self)

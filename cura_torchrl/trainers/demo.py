@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
+import functools
 import itertools
 import logging
 import math
-import multiprocessing
-import queue
 import shutil
 import sys
 import webbrowser
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from contextlib import closing
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
@@ -36,9 +33,10 @@ from cura_torchrl.trainers.threads import one_thread
 from cura_torchrl.trainers.train import train
 from cura_torchrl.trainers.training.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER
+from cura_torchrl.trainers.worker_pool import WorkerPool, count_one
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from cura_torchrl.envs.config import TaskConfig
@@ -57,7 +55,6 @@ TRAINING_FOLDER = "training"
 _FIRST_RATE = 1e-4
 """Largest learning rate to go on with where none is known: Adam has to find its moments again [1]."""
 _Pair = tuple[Recording, Recording]
-_T = TypeVar("_T")
 
 
 def demo(config: DemoConfig) -> Path:
@@ -71,15 +68,16 @@ def demo(config: DemoConfig) -> Path:
 
     Raises:
         RunError: If weights or scenes are missing.
+        WorkerError: If a process that plays or draws dies.
     """  # noqa: DOC502 - raised by what this calls
     loaded = [_load(name, config) for name in config.policies]
     tasks = [_task(config, policy) for policy in loaded]
     scenes = _scenes(config, tasks[0])
     config.run_dir.mkdir(parents=True, exist_ok=True)
-    with _workers(config.num_workers) as workers:
-        pairs = _play(config, loaded, tasks, scenes, workers)
+    with WorkerPool(config.num_workers) as pool:
+        pairs = _play(config, loaded, tasks, scenes, pool)
         telling = most_telling(pairs, config.telling_scenes)
-        cards = _draw(config, [*telling, *(pair for pair in pairs if pair not in telling)], workers)
+        cards = _draw(config, [*telling, *(pair for pair in pairs if pair not in telling)], pool)
     for line in _summary(pairs):
         logger.info("%s", line)
     page = config.run_dir / PAGE_NAME
@@ -167,59 +165,25 @@ def _scenes(config: DemoConfig, task: TaskConfig) -> list[Scene]:
         raise RunError(str(error)) from None
 
 
-@contextmanager
-def _workers(count: int) -> Iterator[Executor]:
-    if count == 1:
-        yield _Here()
-        return
-    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-class _Here(Executor):
-    """Does the work at once, in this process."""
-
-    def submit(self, fn: Callable[..., _T], /, *args: Any, **kwargs: Any) -> Future[_T]:
-        future: Future[_T] = Future()
-        future.set_result(fn(*args, **kwargs))
-        return future
-
-
 def _play(
     config: DemoConfig,
     loaded: Sequence[LoadedPolicy],
     tasks: Sequence[TaskConfig],
     scenes: list[Scene],
-    workers: Executor,
+    pool: WorkerPool,
 ) -> list[_Pair]:
     """Return every scene as both policies play it."""
-    total = sum(task.max_steps + 1 for task in tasks)
-    with tqdm(total=total, desc="play", unit="step", file=sys.stderr) as bar, contextlib.ExitStack() as stack:
-        if isinstance(workers, _Here):
-            report, inbox = bar.update, None
-        else:
-            manager = stack.enter_context(multiprocessing.get_context("spawn").Manager())
-            inbox = manager.Queue()
-            report = inbox.put
-        futures = [
-            workers.submit(_play_one, config, policy.path, task, scenes, label, report)
-            for policy, task, label in zip(loaded, tasks, policy_labels(loaded, config.policies), strict=True)
-        ]
-        while inbox is not None and not all(future.done() for future in futures):
-            with contextlib.suppress(queue.Empty):
-                bar.update(inbox.get(timeout=0.2))
-        played = [future.result() for future in futures]
+    paths, labels = (policy.path for policy in loaded), policy_labels(loaded, config.policies)
+    with tqdm(total=sum(task.max_steps + 1 for task in tasks), desc="play", unit="step", file=sys.stderr) as bar:
+        work = functools.partial(_play_one, config, scenes)
+        played = pool.map(work, list(zip(paths, tasks, labels, strict=True)), tick=bar.update)
         bar.update(bar.total - bar.n)
     return list(zip(*played, strict=True))
 
 
-def _play_one(
-    config: DemoConfig, path: Path, task: TaskConfig, scenes: list[Scene], label: str, report: Callable[[int], object]
-) -> list[Recording]:
+def _play_one(config: DemoConfig, scenes: list[Scene], who: tuple[Path, TaskConfig, str]) -> list[Recording]:
     """Return the recordings of one policy; the scenes run side by side."""
+    path, task, label = who
     loaded = load_policy(path).double()
     env = loaded.make_env(
         len(scenes),
@@ -237,19 +201,21 @@ def _play_one(
             scenes,
             label=label,
             stride=config.frame_stride,
-            watch=lambda _: report(1),
+            watch=lambda _: count_one(),
         )
 
 
-def _draw(config: DemoConfig, pairs: Sequence[_Pair], workers: Executor) -> list[Card]:
+def _draw(config: DemoConfig, pairs: Sequence[_Pair], pool: WorkerPool) -> list[Card]:
     every = itertools.chain(itertools.repeat(1, config.telling_scenes), itertools.repeat(2))
-    futures = [workers.submit(draw_card, pair, every=step) for pair, step in zip(pairs, every, strict=False)]
-    with tqdm(total=len(futures), desc="draw", unit="scene", file=sys.stderr) as bar:
-        cards = []
-        for future in futures:
-            cards.append(future.result())
-            bar.update()
-    return cards
+    with tqdm(total=len(pairs), desc="draw", unit="scene", file=sys.stderr) as bar:
+        return pool.map(_draw_one, list(zip(pairs, every, strict=False)), tick=bar.update)
+
+
+def _draw_one(part: tuple[_Pair, int]) -> Card:
+    pair, every = part
+    card = draw_card(pair, every=every)
+    count_one()
+    return card
 
 
 def _summary(pairs: Sequence[_Pair]) -> Iterator[str]:

@@ -16,80 +16,32 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import torch
 from tqdm import tqdm
 
 from cura_torchrl import keys
-from cura_torchrl.envs.config import Simulator, require, require_finite
 from cura_torchrl.envs.robots.scripted import ScriptedAvoider, ScriptedPusher
 from cura_torchrl.trainers.build import Networks, make_env
 from cura_torchrl.trainers.checkpoint import save_checkpoint, sweep
-from cura_torchrl.trainers.config import Perception
-from cura_torchrl.trainers.methods import method
 from cura_torchrl.trainers.threads import one_thread
 from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER, locked, require_no_run
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
     from cura_torchrl.trainers.config import TrainConfig
+    from cura_torchrl.trainers.training.imitate_config import ImitateConfig
 
 logger = logging.getLogger(__name__)
 
-Expert = Literal["scripted", "avoider"]
-
 _SEEN_KEYS = (keys.OBSERVATION, keys.LATENT)
 """What the networks read."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImitateConfig:
-    """Imitate a scripted pusher."""
-
-    run_dir: Path = Path("runs/imitate")
-    """Folder for the checkpoint."""
-    expert: Expert = "scripted"
-    """Who is imitated: a pusher without obstacles, or one that steers around all of them."""
-    method: str = "push"
-    """Whose robot acts, and whose LiDAR and map the networks see, if there are obstacles."""
-    perception: Perception = "map"
-    """What they see beside their vector, if there are obstacles: the map's code, or for diagnosis the obstacles."""
-    simulator: Simulator = "bullet"
-    """Which simulator runs the worlds."""
-    encoder: Path | None = None
-    """Weights of the map's encoder, as ``pretrain-map`` writes them; none takes those that are shipped."""
-    num_envs: int = 32
-    """Worlds that are played side by side [1]."""
-    rounds: int = 4
-    """Rounds of collecting and fitting [1]; from the second on the learner drives half of the worlds."""
-    steps: int = 500
-    """Policy steps of each world in a round [1]."""
-    epochs: int = 30
-    """Passes over all data after each round [1]."""
-    minibatch_size: int = 512
-    """Frames per gradient step [1]."""
-    lr: float = 1e-3
-    """Learning rate [1]."""
-    noise: float = 0.3
-    """Standard deviation of the smooth noise added to what is executed, not to what is learned [1]."""
-    std: float = 0.25
-    """Standard deviation of the action that training starts with [1]."""
-    seed: int = 0
-    """Seed of scenarios, networks and noise [1]."""
-
-    def __post_init__(self) -> None:
-        require_finite(self)
-        for name in ("num_envs", "rounds", "steps", "epochs", "minibatch_size", "lr", "std"):
-            require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
-        require(self.noise >= 0, "noise", self.noise, "a number that is not negative")
-        _train_config(self)  # what the method, the networks and the seed refuse
 
 
 def imitate(config: ImitateConfig) -> Path:
@@ -112,7 +64,7 @@ def imitate(config: ImitateConfig) -> Path:
 
 def _imitate(config: ImitateConfig) -> Path:
     torch.manual_seed(config.seed)
-    train_config = _train_config(config)
+    train_config = config.train_config
     networks = Networks(train_config)
     env = _make_env(train_config, config)
     rounds, played = [], _rounds(env, networks, config)
@@ -128,25 +80,6 @@ def _imitate(config: ImitateConfig) -> Path:
         env.close()
     folder = config.run_dir / CHECKPOINT_FOLDER
     return save_checkpoint({"networks": networks}, train_config, folder, frames=len(data))
-
-
-def _train_config(config: ImitateConfig) -> TrainConfig:
-    """Return the configuration of the policy: one that sees no map if there are no obstacles."""
-    preset = method(config.method).replace(
-        seed=config.seed,
-        run_dir=config.run_dir,
-        num_envs=config.num_envs,
-        simulator=config.simulator,
-        encoder=config.encoder,
-    )
-    network = dataclasses.replace(preset.network, init_std=config.std)
-    task = dataclasses.replace(preset.env.task, curriculum=())
-    lidar, perception = preset.env.lidar, config.perception
-    if config.expert == "scripted":
-        task = dataclasses.replace(task, scenario=dataclasses.replace(task.scenario, max_obstacles=0))
-        lidar, perception = dataclasses.replace(lidar, num_rays=8), "none"
-    env = dataclasses.replace(preset.env, task=task, lidar=lidar)
-    return preset.replace(network=network, env=env, perception=perception)
 
 
 def _make_env(train_config: TrainConfig, config: ImitateConfig) -> EnvBase:

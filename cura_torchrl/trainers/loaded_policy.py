@@ -138,9 +138,7 @@ def load_policy(source: str | Path) -> LoadedPolicy:
     """  # noqa: DOC502 - raised by what this calls
     path = find_checkpoint(_resolve(source))
     config, record = read_config(path)
-    networks = Networks(config)
-    restore(path, {"networks": networks})
-    networks.requires_grad_(False).eval()
+    networks = read_networks(path, config).requires_grad_(False).eval()
     return LoadedPolicy(
         policy=networks.actor,
         critic=networks.critic,
@@ -149,6 +147,24 @@ def load_policy(source: str | Path) -> LoadedPolicy:
         record=record,
         path=path,
     )
+
+
+def read_networks(path: Path, config: TrainConfig) -> Networks:
+    """Return the networks of a checkpoint.
+
+    Args:
+        path: The checkpoint's folder; verify it first.
+        config: Its configuration.
+
+    Returns:
+        Networks in training mode on the CPU.
+
+    Raises:
+        CheckpointError: If they do not fit the configuration.
+    """  # noqa: DOC502 - raised by what this calls
+    networks = Networks(config)
+    restore(path, {"networks": networks})
+    return networks
 
 
 def _resolve(source: str | Path) -> Path:

@@ -7,18 +7,17 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cura_torchrl.trainers.build import SHIPPED_ENCODER, Networks
+from cura_torchrl.trainers.build import SHIPPED_ENCODER
 from cura_torchrl.trainers.checkpoint import (
     file_sha256,
     find_checkpoint,
     progress_path,
     read_config,
-    restore,
     verify,
     write_checkpoint,
 )
 from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
-from cura_torchrl.trainers.loaded_policy import SHIPPED_FOLDER
+from cura_torchrl.trainers.loaded_policy import SHIPPED_FOLDER, read_networks
 from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER
 
 if TYPE_CHECKING:
@@ -44,8 +43,7 @@ def release(source: Path, destination: Path | None = None) -> Path:
     folder = SHIPPED_FOLDER / config.method if destination is None else destination
     _require_replaceable(folder)
     _require_shipped_encoder(config)
-    networks = Networks(config)
-    restore(path, {"networks": networks})
+    networks = read_networks(path, config)
     # Paths of the machine that trained say nothing elsewhere.
     released = config.replace(run_dir=Path("runs") / config.method, encoder=None)
     folder.parent.mkdir(parents=True, exist_ok=True)

@@ -81,7 +81,7 @@ def play_scene(config: RenderConfig, loaded: Sequence[LoadedPolicy]) -> list[Rec
 
         for policy, task, label in zip(loaded, tasks, policy_labels(loaded, config.methods), strict=True):
             scene = find_scene(task.scenario, seed=config.seed, index=config.scene)
-            env = policy.make_evaluation_env(config.chunk, config, simulator=config.simulator, keep_map=True)
+            env = policy.make_evaluation_env(1, config, simulator=config.simulator, keep_map=True)
             with one_thread(), closing(env):
                 recordings += record(
                     env, policy.policy, policy.collision_estimator, [scene], label=label, stride=1, watch=note

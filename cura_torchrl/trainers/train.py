@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import logging
 import signal
-import threading
 import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -33,12 +32,12 @@ from cura_torchrl.trainers.training.learner import Learner
 from cura_torchrl.trainers.training.progress import Progress, require_logger
 from cura_torchrl.trainers.training.ray_backend import RayRollouts, require_ray
 from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER, locked, require_no_run
+from cura_torchrl.trainers.training.signals import Interruption
 from cura_torchrl.trainers.training.warm_start import start_from
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
-    from types import FrameType
 
     from torchrl.collectors import BaseCollector
 
@@ -88,7 +87,7 @@ def train(config: TrainConfig, *, resume: bool = False, init_from: Path | None =
         require_ray()
     if config.perception == "map":
         fitting_encoder(config)  # what is wrong with it is told before there is a folder
-    with locked(config.run_dir), _Signals() as signals:
+    with locked(config.run_dir), Interruption(signal.SIGINT, signal.SIGTERM) as signals:
         return _Run(config, resume=resume, init_from=init_from).loop(signals)
 
 
@@ -154,7 +153,7 @@ class _Run:
                 logger.info("%s: %s -> %s", name, old, new)
         return source
 
-    def loop(self, signals: _Signals) -> Path:
+    def loop(self, signals: Interruption) -> Path:
         # Trains until the frames are spent.
         frames = self.learner.frames
         checkpoint = self._save() if frames == 0 else find_checkpoint(self.config.run_dir)
@@ -186,7 +185,7 @@ class _Run:
             self.policy.load_state_dict(self.learner.networks.actor.state_dict())
 
     def _collect(
-        self, signals: _Signals, progress: Progress, recent: RecentEpisodes, without: frozenset[str]
+        self, signals: Interruption, progress: Progress, recent: RecentEpisodes, without: frozenset[str]
     ) -> frozenset[str]:
         # Trains until the frames are spent or nodes have died, and returns which.
         frames = self.learner.frames
@@ -205,7 +204,7 @@ class _Run:
     def _iterate(
         self,
         collector: BaseCollector | RayRollouts,
-        signals: _Signals,
+        signals: Interruption,
         progress: Progress,
         recent: RecentEpisodes,
     ) -> None:
@@ -242,48 +241,8 @@ class _Run:
         return path
 
 
-class _Signals:
-    """Turns SIGINT and SIGTERM into an exception, but never in the middle of an update; a second one acts at once."""
-
-    def __init__(self) -> None:
-        self._number: int | None = None
-        self._may_raise = False
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> _Signals:
-        if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._restore()
-
-    @contextmanager
-    def raising(self) -> Iterator[None]:
-        """Let a signal interrupt what is done in this context."""
-        self._may_raise = True
-        try:
-            self._check()
-            yield
-        finally:
-            self._may_raise = False
-
-    def _handle(self, number: int, _: FrameType | None) -> None:
-        self._number = number
-        self._restore()
-        self._check()
-
-    def _check(self) -> None:
-        if self._may_raise and self._number is not None:
-            raise Interrupted(self._number)
-
-    def _restore(self) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-
 @contextmanager
-def _worker_errors(signals: _Signals) -> Iterator[None]:
+def _worker_errors(signals: Interruption) -> Iterator[None]:
     # TorchRL tells of a process that died by one of these, after the worker's own traceback has been printed. A signal
     # to the whole process group ends the workers too.
     try:

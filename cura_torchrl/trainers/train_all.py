@@ -10,10 +10,9 @@ import shlex
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections import Counter, deque
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, weights_sha256
 from cura_torchrl.trainers.decoding import changed_fields
@@ -21,13 +20,13 @@ from cura_torchrl.trainers.errors import CheckpointError, Interrupted
 from cura_torchrl.trainers.info import hardware
 from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER, is_locked
 from cura_torchrl.trainers.training.run_status import RunStatus, read_record, read_status, write_record
+from cura_torchrl.trainers.training.signals import StopRequests
 from cura_torchrl.trainers.training.train_all_config import PlannedRun, TrainAllConfig, default_jobs
 from cura_torchrl.trainers.training.train_all_display import Display
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
-    from types import FrameType
 
     from cura_torchrl.trainers.config import TrainConfig
 
@@ -75,18 +74,18 @@ def train_all(
     for run in runs:
         _require_same(run, starts)
     jobs = config.jobs or default_jobs(runs[0].config, hardware()["cores"])
-    with _Signals() as received, Display(runs) as display:
+    with StopRequests(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as signals, Display(runs) as display:
         schedule = _Schedule(
             runs, jobs=jobs, retries=config.retries, command=command or train_command, starts=starts, tell=display.tell
         )
         try:
-            while schedule.step(len(received)):
+            while schedule.step(len(signals.received)):
                 display.show(schedule.running)
                 time.sleep(_POLL_SECONDS)
         finally:
             schedule.end()
-    if received:
-        raise Interrupted(received[0], _ADVICE)
+    if signals.received:
+        raise Interrupted(signals.received[0], _ADVICE)
     return [read_status(run) for run in runs]
 
 
@@ -226,28 +225,6 @@ class _Schedule:
             elif stops > self.stops:
                 _end_group(process.pid)
         self.stops = stops
-
-
-class _Signals:
-    """Counts the requests to stop, instead of ending this process before its children."""
-
-    def __init__(self) -> None:
-        self._before: dict[int, Any] = {}
-        self._received: list[int] = []
-
-    def __enter__(self) -> list[int]:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup has it
-                    self._before[number] = signal.signal(number, self._handle)
-        return self._received
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number: int, _: FrameType | None) -> None:
-        self._received.append(number)
 
 
 def _require_same(run: PlannedRun, starts: Mapping[Path, str]) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import multiprocessing
 import os
 import threading
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -13,6 +14,8 @@ from cura_torchrl.trainers.errors import WorkerError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
+    from typing_extensions import Self
 
 _Part = TypeVar("_Part")
 _Result = TypeVar("_Result")
@@ -22,57 +25,138 @@ _POLL = 0.5
 
 _counter: Any = None
 """In a worker: what all workers of the pool have done [1], shared with their parent."""
+_tick: Callable[[int], object] | None = None
+"""Where a part is worked on in the process of the pool: what is told of it."""
 
 
-def in_processes(
-    work: Callable[[_Part], _Result],
-    parts: Sequence[_Part],
-    num_workers: int,
-    *,
-    keep: Callable[[_Part, _Result], object],
-    tick: Callable[[int], object],
-) -> None:
-    """Work on parts in processes of their own, which end when this one does, even if it is killed.
+class WorkerPool:
+    """Works on parts: in processes of their own, or here if one worker is asked for.
+
+    Processes are started when there is work for them, and end when this one does, even if it is killed.
 
     Args:
-        work: What to do with a part; it and all that it takes and returns can be pickled.
-        parts: The parts; they are begun in this order.
-        num_workers: Number of processes [1].
-        keep: Called here with each part and its result, as they come.
-        tick: Called here with how much :func:`count_one` counted since it was called last [1].
-
-    Raises:
-        WorkerError: If a process dies.
+        num_workers: How many parts are worked on side by side [1].
     """
-    context = multiprocessing.get_context("spawn")
-    counter, told = context.Value("q", 0), 0
-    with ProcessPoolExecutor(
-        min(num_workers, len(parts)), mp_context=context, initializer=_begin, initargs=(counter,)
-    ) as pool:
-        futures = {pool.submit(work, part): part for part in parts}
-        waiting = set(futures)
+
+    def __init__(self, num_workers: int) -> None:
+        self._pool: ProcessPoolExecutor | None = None
+        self._told = 0
+        if num_workers > 1:
+            context = multiprocessing.get_context("spawn")
+            self._counter = context.Value("q", 0)
+            self._pool = ProcessPoolExecutor(
+                num_workers, mp_context=context, initializer=_begin, initargs=(self._counter,)
+            )
+
+    def __enter__(self) -> Self:
+        """Open the pool.
+
+        Returns:
+            The pool.
+        """
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the processes; parts that have not been begun are left."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def run(
+        self,
+        work: Callable[[_Part], _Result],
+        parts: Sequence[_Part],
+        *,
+        keep: Callable[[_Part, _Result], object],
+        tick: Callable[[int], object],
+    ) -> None:
+        """Work on parts.
+
+        Args:
+            work: What to do with a part; it and all that it takes and returns can be pickled.
+            parts: The parts; they are begun in this order.
+            keep: Called here with each part and its result, as they come.
+            tick: Called here with how much :func:`count_one` counted since it was called last [1].
+
+        Raises:
+            WorkerError: If a process dies.
+        """
+        if self._pool is None:
+            _run_here(work, parts, keep, tick)
+            return
         try:
+            futures = {self._pool.submit(work, part): part for part in parts}
+            waiting = set(futures)
             while waiting:
                 done, waiting = wait(waiting, timeout=_POLL, return_when=FIRST_COMPLETED)
-                now = counter.value
-                if now > told:
-                    tick(now - told)
-                    told = now
+                self._tell(tick)
                 # What is done first: where a process has died, others may have ended just before.
-                for future in sorted(done, key=lambda future: future.exception() is not None):
+                for future in sorted(done, key=_has_failed):
                     keep(futures[future], future.result())
         except BrokenProcessPool:
-            msg = "a process that plays has died; accepted: the same command again, perhaps with fewer workers"
+            msg = "a worker process has died; accepted: the same command again, perhaps with fewer workers"
             raise WorkerError(msg) from None
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)  # else leaving the block would work on to the end
+
+    def map(
+        self, work: Callable[[_Part], _Result], parts: Sequence[_Part], *, tick: Callable[[int], object]
+    ) -> list[_Result]:
+        """Work on parts, and return what comes of them.
+
+        Args:
+            work: See :meth:`run`.
+            parts: See :meth:`run`.
+            tick: See :meth:`run`.
+
+        Returns:
+            Results in the order of the parts.
+
+        Raises:
+            WorkerError: If a process dies.
+        """  # noqa: DOC502 - raised by what this calls
+        found: dict[int, _Result] = {}
+
+        def keep(part: tuple[int, _Part], result: _Result) -> None:
+            found[part[0]] = result
+
+        self.run(functools.partial(_numbered, work), list(enumerate(parts)), keep=keep, tick=tick)
+        return [found[number] for number in range(len(parts))]
+
+    def _tell(self, tick: Callable[[int], object]) -> None:
+        now = self._counter.value
+        if now > self._told:
+            tick(now - self._told)
+            self._told = now
 
 
 def count_one() -> None:
-    """Tell the process that started this one that one more piece of a part is done."""
+    """Tell who works with the pool that one more piece of a part is done; elsewhere it does nothing."""
+    if _tick is not None:
+        _tick(1)
     if _counter is not None:
         with _counter.get_lock():
             _counter.value += 1
+
+
+def _run_here(
+    work: Callable[[_Part], _Result],
+    parts: Sequence[_Part],
+    keep: Callable[[_Part, _Result], object],
+    tick: Callable[[int], object],
+) -> None:
+    global _tick  # noqa: PLW0603 - count_one is called from deep inside of the work
+    before, _tick = _tick, tick
+    try:
+        for part in parts:
+            keep(part, work(part))
+    finally:
+        _tick = before
+
+
+def _numbered(work: Callable[[_Part], _Result], part: tuple[int, _Part]) -> _Result:
+    return work(part[1])
+
+
+def _has_failed(future: Future[Any]) -> bool:
+    return future.exception() is not None
 
 
 def _begin(counter: Any) -> None:

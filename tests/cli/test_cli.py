@@ -24,6 +24,8 @@ from cura_torchrl.trainers.pages.demo_config import DemoConfig
 from cura_torchrl.trainers.pages.report_config import ReportConfig
 from cura_torchrl.trainers.pictures.render_config import RenderConfig
 from cura_torchrl.trainers.pictures.view_config import ViewConfig
+from cura_torchrl.trainers.training.imitate_config import ImitateConfig
+from cura_torchrl.trainers.training.pretrain_map_config import PretrainMapConfig
 from cura_torchrl.trainers.training.progress import PROGRESS_NAME, read_progress
 from cura_torchrl.trainers.training.run_folder import is_locked
 from cura_torchrl.trainers.training.run_status import read_record
@@ -41,9 +43,9 @@ SMALL = [
 FRAMES = 8
 
 
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+def run(*arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run the command line to its end."""
-    environment = {**os.environ, "COLUMNS": "200"}
+    environment = {**os.environ, "COLUMNS": "200", **variables}
     return subprocess.run(
         [*COMMAND, *arguments], capture_output=True, text=True, timeout=280, env=environment, check=False
     )
@@ -84,6 +86,8 @@ def test_help_lists_every_command_and_method() -> None:
 @pytest.mark.parametrize(
     ("command", "config"),
     [
+        ("pretrain-map", PretrainMapConfig),
+        ("imitate", ImitateConfig),
         ("train", TrainConfig),
         ("train-all", TrainAllConfig),
         ("evaluate", EvaluateConfig),
@@ -99,8 +103,11 @@ def test_help_lists_every_command_and_method() -> None:
 )
 def test_help_lists_every_field(command: str, config: type[object]) -> None:
     """Catches a setting that can only be changed in the code, and help that has to import torch."""
-    done = run(command, "--help")
+    done = run(command, "--help", PYTHONPROFILEIMPORTTIME="1")
     assert done.returncode == 0
+    imported = [line.rsplit("|", 1)[-1].strip() for line in done.stderr.splitlines() if line.startswith("import time:")]
+    assert "tyro" in imported
+    assert "torch" not in imported
     words = done.stdout.replace("│", " ").replace(",", " ").split()
     positional = {"--target", "--runs"}
     assert [flag for flag in flags(config) if flag not in words and flag not in positional] == []

@@ -137,7 +137,7 @@ class BaseController:
         # tau = M (M + D dt + K dt^2)^-1 (...): the implicit (stable) form of the impedance law.
         stiffness, damping = self._constants[:2]
         implicit = mass_matrix + torch.diag(damping * self.period + stiffness * self.period**2)
-        self._gain[...] = mass_matrix @ torch.linalg.inv_ex(implicit).inverse
+        self._gain[...] = geometry.matvec(geometry.inverse(implicit)[:, None], mass_matrix)  # the inverse is symmetric
 
     def torques(self, position: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
         """Return the joint forces of one tick.

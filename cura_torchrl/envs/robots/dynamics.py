@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import pytorch_kinematics as pk
 import torch
 
+from cura_torchrl.envs import geometry
 from cura_torchrl.envs.robots.kinematics import ArmKinematics
 from cura_torchrl.envs.robots.ridgeback import BASE_LINK, BASE_LINK_HEIGHT
 from cura_torchrl.envs.robots.ridgeback import URDF as BASE_URDF
@@ -99,7 +100,8 @@ class RobotDynamics:
         angular, linear = twists[..., :3], twists[..., 3:]
         force = mass[..., None] * linear + torch.cross(angular, moment, dim=-1)
         torque = (tensor @ angular[..., None])[..., 0] + torch.cross(moment, linear, dim=-1)
-        product = twists @ torch.cat([torque, force], dim=-1).mT  # [i, j] holds for i <= j
+        wrenches = torch.cat([torque, force], dim=-1)
+        product = geometry.matvec(wrenches[:, None], twists)  # [i, j] of twist i and wrench j holds for i <= j
         matrix = product.triu() + product.triu(1).mT
         return self._in_world(matrix, joint_position[:, 2])
 

@@ -145,7 +145,7 @@ class PlanarWorlds:
     def _run(self, law: TorqueLaw, ticks: int) -> None:
         self._contact[...] = False
         # What cannot be inverted becomes a state that is not finite; to be told at once would wait for the device.
-        self._inverse_inertia = torch.linalg.inv_ex(self._inertia).inverse
+        self._inverse_inertia = geometry.inverse(self._inertia)
         for start in range(0, ticks, law.ik_ticks):
             law.solve_ik()
             self._robot.linearize(law.hand, self._position, self._inverse_inertia)

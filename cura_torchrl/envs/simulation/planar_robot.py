@@ -51,7 +51,8 @@ class PlanarRobot:
             position: Joints, base first [m, rad], shape ``[N, J]``.
             inverse_inertia: Inverse of the joint-space inertia, shape ``[N, J, J]``.
         """
-        mobility = self._jacobian @ inverse_inertia[:, None] @ self._jacobian.mT
+        answer = geometry.matvec(inverse_inertia[:, None, None], self._jacobian)
+        mobility = geometry.matvec(self._jacobian[:, :, None], answer)  # J M^-1 J^T
         self._mobility = mobility.permute(2, 3, 1, 0).contiguous()
         self._flat_jacobian = self._jacobian.flatten(1, 2)
 

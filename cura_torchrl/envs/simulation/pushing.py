@@ -188,7 +188,7 @@ class _Floor:
     def impulse(self, impulse: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:
         velocity = torch.stack([twist[0] - twist[2] * self._y, twist[1] + twist[2] * self._x])
         wanted = impulse - self._step * velocity
-        size = torch.hypot(wanted[0], wanted[1]).clamp_min(_TINY)
+        size = _length(wanted[0], wanted[1]).clamp_min(_TINY)
         return wanted * (self._limit / size).clamp_max(1.0)
 
     def push(self, twist: torch.Tensor, impulse: torch.Tensor) -> torch.Tensor:
@@ -240,7 +240,7 @@ class _Touch:
         step = 1 / (self._tangent_weight[point] + softness)
         left = impulse[1] - (rate_y * self._x - rate_x * self._y + softness * impulse[1]) * step
         up = impulse[2] + (pusher_twist[2] - softness * impulse[2]) * step
-        scale = (self._friction * normal / torch.hypot(left, up).clamp_min(_TINY)).clamp_max(1.0)
+        scale = (self._friction * normal / _length(left, up).clamp_min(_TINY)).clamp_max(1.0)
         return torch.stack([normal, left * scale, up * scale])
 
     def push(
@@ -265,6 +265,10 @@ class _Touch:
         x, y, up = self.forces(impulse)
         far_x, far_y = self._far
         return torch.stack([x, y, up, far_x * y - far_y * x]).sum(1)
+
+
+def _length(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    return (x * x + y * y).sqrt()
 
 
 def _expanded(rectangle: Rectangle, like: torch.Tensor) -> Rectangle:

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
+_ACTION_LEVELS = 2.0**20
+"""Actions are rounded to multiples of one over this. Last bits of a policy's matrix products, which depend on batch and
+processor, so do not reach the simulator, where contact makes ten times as much of them in every step."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
@@ -64,8 +68,8 @@ def play_episodes(
         policy: Writes the action.
         indices: Scenarios to play, int64, shape ``[M]``, M at least 1.
         report: Called with every episode when it is over.
-        watch: Called with what the environment emits at the start and after every step, batch size ``[N]``, and with
-            the rows that were being played until then, bool, shape ``[N]``.
+        watch: Called with what the environment emits, batch size ``[N]``, and with the rows that are new in it, bool,
+            shape ``[N]``: after a step those that were being played until then, after a reset those that begin.
         meter: Measures the episodes; it needs an environment with ``TaskConfig.privileged``.
         exploration: How the policy's distribution becomes an action.
 
@@ -84,7 +88,8 @@ def play_episodes(
         measure(state, playing >= 0)
         while len(outcomes) < len(indices):
             state = policy(state)
-            state[keys.ACTION] = torch.where(playing.unsqueeze(-1) < 0, 0.0, state[keys.ACTION])
+            action = (state[keys.ACTION] * _ACTION_LEVELS).round() / _ACTION_LEVELS
+            state[keys.ACTION] = torch.where(playing.unsqueeze(-1) < 0, 0.0, action)
             after = env.step(state)["next"]
             watch(after, playing >= 0)
             measure(after, (playing >= 0) & (reached == 0))
@@ -101,6 +106,7 @@ def play_episodes(
             is_fresh = has_ended & (playing >= 0)
             if is_fresh.any():
                 state = env.reset(state.set("_reset", is_fresh[:, None]), episodes=indices[playing.clamp_min(0)])
+                watch(state, is_fresh)
                 measure(state, is_fresh)
     return [outcomes[number] for number in range(len(indices))]
 

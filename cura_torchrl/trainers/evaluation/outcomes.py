@@ -119,8 +119,8 @@ class OutcomeStore:
 
     Args:
         path: The file; it is made, with its folder, where there is none.
-        chunk: Episodes that are played side by side [1]. Policies round differently in batches of another size, so that
-            a file that was filled with another number is refused.
+        chunk: Episodes that are played side by side [1]. The last bits depend on it; a file that was filled with
+            another number is refused.
 
     Raises:
         RunError: If the file is damaged, is no file of outcomes, is of another version or of another ``chunk``.

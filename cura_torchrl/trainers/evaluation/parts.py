@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,7 +17,7 @@ from cura_torchrl.trainers.evaluation.measures import EpisodeMeter
 from cura_torchrl.trainers.evaluation.task import evaluation_task
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.threads import one_thread
-from cura_torchrl.trainers.worker_pool import count_one, in_processes
+from cura_torchrl.trainers.worker_pool import WorkerPool, count_one
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -122,33 +120,34 @@ def play_parts(
         tick: Called with the number of episodes that were over since it was called last [1].
 
     Raises:
-        WorkerError: If a process that plays has died.
+        WorkerError: If a process that plays dies.
     """  # noqa: DOC502 - raised by what this calls
-    if num_workers > 1 and parts:
-        in_processes(_play_in_worker, parts, num_workers, keep=keep, tick=tick)
-        return
-    for config, group in itertools.groupby(parts, key=lambda part: part.config):
-        with one_thread(), closing(Player(config)) as player:
-            for part in group:
-                keep(part, player.play(part, lambda _: tick(1)))
+    with WorkerPool(num_workers) as pool:
+        try:
+            pool.run(_play, parts, keep=keep, tick=tick)
+        finally:
+            _close_players()
 
 
-def _play_in_worker(part: Part) -> list[Episode]:
+def _play(part: Part) -> list[Episode]:
     with one_thread():
-        # The worlds are kept for the next part.
-        return _worker_player(part.config).play(part, lambda _: count_one())
+        return _player(part.config).play(part, lambda _: count_one())
 
 
 _players: dict[EvaluateConfig, Player] = {}
-"""In a worker: the one that played last."""
+"""The one that played last in this process: its worlds are kept for the next part."""
 
 
-def _worker_player(config: EvaluateConfig) -> Player:
+def _player(config: EvaluateConfig) -> Player:
     if config not in _players:
-        while _players:
-            _players.popitem()[1].close()  # worlds of PyBullet take 28 MB each until they are closed
+        _close_players()
         _players[config] = Player(config)
     return _players[config]
+
+
+def _close_players() -> None:
+    while _players:
+        _players.popitem()[1].close()  # worlds of PyBullet take 28 MB each until they are closed
 
 
 def _build(config: EvaluateConfig) -> tuple[EnvBase, Callable[[TensorDictBase], TensorDictBase]]:

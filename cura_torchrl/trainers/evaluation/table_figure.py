@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import math
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -14,9 +12,11 @@ from matplotlib.lines import Line2D
 from cura_torchrl.trainers.evaluation.table_report import cell_label
 from cura_torchrl.trainers.methods import PRESETS
 from cura_torchrl.trainers.pictures import raster
+from cura_torchrl.trainers.pictures.axes import encode
 
 if TYPE_CHECKING:
     from cura_torchrl.trainers.evaluation.table_numbers import Result
+    from cura_torchrl.trainers.pictures.render_config import StillFormat
 
 _COLOURS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d31", "#7a7a7a", "#5e3c99", "#b8b800",
@@ -36,11 +36,9 @@ _MARK: dict[str, Any] = {
     "zorder": 5,
 }
 """Where the paper's number is."""
-_DOTS = 140
-"""Resolution of the PNG [pixel/inch]."""
 
 
-def table_figure(results: list[Result], title: str, form: Literal["png", "svg"]) -> bytes:
+def table_figure(results: list[Result], title: str, form: StillFormat) -> bytes:
     """Return success per method and cell as bars, with their intervals and the paper's numbers.
 
     Args:
@@ -62,11 +60,7 @@ def table_figure(results: list[Result], title: str, form: Literal["png", "svg"])
         # Rows of as many places, so that bars are as wide in the last one.
         axis.set_xlim(-0.5, per_row - 0.5)
     _add_legend(figure, methods, results, title)
-    drawn = io.BytesIO()
-    with mpl.rc_context({"svg.hashsalt": "cura-torchrl"}):
-        stamp = {"Date": None} if form == "svg" else {"Software": None}
-        figure.savefig(drawn, format=form, dpi=_DOTS, facecolor="white", bbox_inches="tight", metadata=stamp)
-    return drawn.getvalue()
+    return encode(figure, form, cut=True)
 
 
 def _draw_row(axis: Any, found: dict[tuple[str, str], Result], methods: list[str], cells: list[str]) -> None:

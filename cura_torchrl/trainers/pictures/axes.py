@@ -47,23 +47,25 @@ def set_margins(
     figure.subplots_adjust(left / width, bottom / height, 1 - right / width, 1 - top / height)
 
 
-def encode(figure: Figure, kind: StillFormat) -> bytes:
+def encode(figure: Figure, kind: StillFormat, *, cut: bool = False) -> bytes:
     """Return a figure as a file.
 
     Args:
         figure: The figure.
         kind: Format of the file.
+        cut: Whether the picture ends where what is drawn does, inside of the figure or beyond it.
 
     Returns:
         Content of the file; the same figure gives the same.
     """
     drawn = io.BytesIO()
+    extent = "tight" if cut else None
     if kind == "svg":
         # Nothing is there by chance: neither a date nor names of parts.
         with mpl.rc_context({"svg.hashsalt": "figure"}):
-            figure.savefig(drawn, format="svg", facecolor="white", metadata={"Date": None})
+            figure.savefig(drawn, format="svg", facecolor="white", bbox_inches=extent, metadata={"Date": None})
         return drawn.getvalue()
-    figure.savefig(drawn, format="png", dpi=_DOTS, facecolor="white")
+    figure.savefig(drawn, format="png", dpi=_DOTS, facecolor="white", bbox_inches=extent)
     # A palette of 256 colours makes a third of the size.
     image = Image.open(drawn).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     packed = io.BytesIO()

@@ -57,9 +57,6 @@ class RenderConfig:
     as it was."""
     size: tuple[int, int] = (640, 480)
     """Width and height of a method's 3-D picture [pixel]; the time for a frame grows with their product."""
-    chunk: int = 20
-    """Worlds in the networks' batch [1], of which one plays; networks round differently in batches of another size, so
-    take that of the evaluation that is to be shown."""
     out: Path = Path("runs/render")
     """Folder for the files."""
 
@@ -72,8 +69,7 @@ class RenderConfig:
             require(0 <= getattr(self, name) < 2**31, name, getattr(self, name), "0 to 2147483647")
         require(0.3 <= self.object_size <= 1.2, "object_size", self.object_size, "0.3 to 1.2 m")
         require(0 <= self.max_obstacles <= 6, "max_obstacles", self.max_obstacles, "0 to 6")
-        for name in ("every", "chunk"):
-            require(getattr(self, name) > 0, name, getattr(self, name), "1 or more")
+        require(self.every > 0, "every", self.every, "1 or more")
         require(1.0 <= self.fps <= 60.0, "fps", self.fps, "1 to 60 Hz")
         are_sizes = all(
             least <= edge <= 2048 and edge % 2 == 0 for least, edge in zip((480, 240), self.size, strict=True)

@@ -12,6 +12,7 @@ import torch
 from cura_torchrl.envs.config import LidarConfig, PushEnvConfig, RobotConfig, ScenarioConfig, TaskConfig
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.push import PushEnv
+from cura_torchrl.envs.robots.scripted import ScriptedPusher
 from tests.contracts.env import LIMIT, EnvContract, assert_same, draw_actions, play
 from tests.worlds import place
 
@@ -79,6 +80,26 @@ def make() -> Iterator[Any]:
     yield build
     for env in envs:
         env.close()
+
+
+@pytest.mark.parametrize("model", ["ridgeback_franka", "ridgeback"])
+@pytest.mark.parametrize("simulator", ["planar", "bullet"])
+def test_what_is_pushed_moves_bitwise_as_it_does_alone(make: Any, simulator: Any, model: Any) -> None:
+    """Catches products that round by the size of the batch: contact makes ten times as much of it in every step."""
+    robot = RobotConfig(model=model)
+    config = dataclasses.replace(make_config(50), simulator=simulator, robot=robot)
+    # What is emitted is rounded to float32; the simulators' own state is not. 33 is no multiple of a vector's width.
+    together, alone, pusher = make(33, config), make(1, config), ScriptedPusher(robot)
+    row, steps = 31, 20
+    data = together.reset()
+    single = alone.reset(episodes=data["episode"][row])
+    for _ in range(steps):
+        action = pusher(data)["action"]
+        data = together.step(data)["next"]
+        single = alone.step(single.set("action", action[row : row + 1]))["next"]
+        for name, value in vars(alone.world_state).items():
+            assert torch.equal(value[0], getattr(together.world_state, name)[row]), name
+    assert together.world_state.object_velocity[row].norm() > 0.1
 
 
 def steady(env: PushEnv, steps: int, *action: float) -> torch.Tensor:

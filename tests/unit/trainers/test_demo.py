@@ -17,6 +17,7 @@ from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.methods import METHODS
 from cura_torchrl.trainers.training.progress import read_progress
+from cura_torchrl.trainers.worker_pool import WorkerPool
 from tests.recordings import make_recording
 from tests.runs import short_evaluation, tiny_run
 
@@ -82,7 +83,7 @@ def test_both_play_in_the_same_worlds_wherever_they_were_trained(tmp_path: Path)
     config = tiny_demo(runs, tmp_path)
     loaded = [load_policy(run) for run in runs]
     tasks = [module._task(config, policy) for policy in loaded]
-    ((one, other), *_) = module._play(config, loaded, tasks, module._scenes(config, tasks[0]), module._Here())
+    ((one, other), *_) = module._play(config, loaded, tasks, module._scenes(config, tasks[0]), WorkerPool(1))
     np.testing.assert_array_equal(one.base_pose, other.base_pose)
     assert np.ptp(one.base_pose[:, 0]) > 0
 

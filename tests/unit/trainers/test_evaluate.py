@@ -84,8 +84,8 @@ def test_a_world_that_is_over_takes_the_next_scene_or_stands_still() -> None:
     assert [entry.index for entry in played] == [7, 3, 11]
     assert told == played
     assert [entry.steps for entry in played] == [5, 5, 5]  # 1 s at 5 Hz
-    # The start and five steps of two scenes, then five steps of the third while the other world stands still.
-    assert seen == [([7, 3], [True, True])] * 6 + [([11, 3], [True, False])] * 5
+    # The start and five steps of two scenes, then those of the third while the other world stands still.
+    assert seen == [([7, 3], [True, True])] * 6 + [([11, 3], [True, False])] * 6
 
 
 def test_a_single_scene_is_played_once_whatever_the_number_of_worlds() -> None:
@@ -125,8 +125,8 @@ def windows_of(scenes: list[int]) -> torch.Tensor:
 
 def test_what_is_seen_in_a_scene_does_not_depend_on_the_scenes_before_it() -> None:
     """Catches a map, a pose or a clock that is carried from one scene of a world to the next."""
-    # The start is watched in the first scene only: scene 9 is windows 16 to 30 in one order, 31 to 45 in the other.
-    second, third = windows_of([4, 9, 2])[16:31], windows_of([2, 4, 9])[31:46]
+    # 16 windows a scene, that of the start included.
+    second, third = windows_of([4, 9, 2])[16:32], windows_of([2, 4, 9])[32:48]
     assert torch.equal(second, third)
     assert not torch.equal(second[0], second[-1])
 
@@ -250,7 +250,7 @@ def test_a_worker_closes_the_worlds_of_the_cell_before(monkeypatch: pytest.Monke
     monkeypatch.setattr(parts, "Player", Watched)
     for size, worlds in ((0.5, 1), (0.5, 1), (1.0, 2)):
         config = EvaluateConfig(policy="scripted", object_size=size, simulator="planar", chunk=1, episodes=1)
-        player = parts._worker_player(config)
+        player = parts._player(config)
         assert player is made[-1]
         assert len(made) == worlds
     assert closed == made[:1]

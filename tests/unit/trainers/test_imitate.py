@@ -14,8 +14,9 @@ from cura_torchrl.envs.robots.scripted import ScriptedPusher
 from cura_torchrl.trainers.build import LATENT_SIZE, Networks
 from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, restore
 from cura_torchrl.trainers.errors import CheckpointError
-from cura_torchrl.trainers.imitate import ImitateConfig, _make_env, _rounds, _train_config, imitate
+from cura_torchrl.trainers.imitate import _make_env, _rounds, imitate
 from cura_torchrl.trainers.methods import method
+from cura_torchrl.trainers.training.imitate_config import ImitateConfig
 from cura_torchrl.trainers.training.run_folder import locked
 
 
@@ -115,7 +116,7 @@ def test_a_round_goes_on_where_the_last_one_ended():
 
 
 def _played(config):
-    train_config = _train_config(config)
+    train_config = config.train_config
     with closing(_make_env(train_config, config)) as env:
         return list(_rounds(env, Networks(train_config), config))
 

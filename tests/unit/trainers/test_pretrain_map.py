@@ -16,8 +16,9 @@ from cura_torchrl.envs.config import MapConfig
 from cura_torchrl.modules.map_vae import MapVAE
 from cura_torchrl.trainers import pretrain_map
 from cura_torchrl.trainers.errors import RunError
-from cura_torchrl.trainers.pretrain_map import PretrainMapConfig, measure
+from cura_torchrl.trainers.pretrain_map import measure
 from cura_torchrl.trainers.training.map_dataset import MapDataset, RandomPusher, pack_maps, unpack_maps, unpacking_table
+from cura_torchrl.trainers.training.pretrain_map_config import PretrainMapConfig
 from tests.scenes import ScanEnv
 
 if TYPE_CHECKING:

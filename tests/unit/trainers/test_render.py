@@ -23,15 +23,15 @@ from tests.recordings import make_recording
 if TYPE_CHECKING:
     from pathlib import Path
 
-SCENE, CHUNK = 3, 5
+SCENE = 3
 
 
 def test_the_scene_is_played_as_evaluate_plays_it() -> None:
-    """Catches another scene, task or batch: evaluate plays scenes 0 to 4 side by side, here 3 is played alone."""
-    scenes = {"scenario": "adversarial", "object_size": 1.0, "simulator": "planar", "chunk": CHUNK}
-    known = evaluate(EvaluateConfig(method="push", episodes=CHUNK, **scenes))
+    """Catches another scene, task or precision: evaluate plays scenes 0 to 4 side by side, here 3 is played alone."""
+    scenes = {"scenario": "adversarial", "object_size": 1.0, "simulator": "planar"}
+    known = evaluate(EvaluateConfig(method="push", episodes=5, chunk=5, **scenes))
     config = RenderConfig(methods=("push",), scene=SCENE, **scenes)
-    (recording,) = play_scene(config, [load_policy("push")])
+    (recording,) = play_scene(config, [load_policy("push").double()])
     assert outcome_letter(recording.episode) == known["outcomes"][SCENE]
     assert recording.scene.kind == "adversarial"
     assert recording.scene.object_edge == 1.0

@@ -1,32 +1,43 @@
-"""Parts of a job in processes of their own."""
+"""Parts of a job in processes of their own, or in this one."""
 
 from __future__ import annotations
 
 import os
+import time
 
 import pytest
 
 from cura_torchrl.trainers.errors import WorkerError
-from cura_torchrl.trainers.worker_pool import count_one, in_processes
+from cura_torchrl.trainers.worker_pool import WorkerPool, count_one
 
 
 def _square(number: int) -> int:
     count_one()
     if number < 0:
+        time.sleep(2.0)  # the others are done by then
         os._exit(1)
     return number * number
 
 
-def test_every_part_is_kept_with_its_own_result() -> None:
-    """Catches results that are kept for another part, and work that is not told."""
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_every_part_is_kept_with_its_own_result(num_workers: int) -> None:
+    """Catches results that are kept for another part, and work that is not told, also when a pool is used again."""
     kept, told = {}, []
-    in_processes(_square, [1, 2, 3], 2, keep=kept.__setitem__, tick=told.append)
+    with WorkerPool(num_workers) as pool:
+        pool.run(_square, [1, 2, 3], keep=kept.__setitem__, tick=told.append)
+        assert pool.map(_square, [5, 4, 6, 5], tick=told.append) == [25, 16, 36, 25]
     assert kept == {1: 1, 2: 4, 3: 9}
+    assert sum(told) == 7
+    count_one()  # nobody waits for it
+    assert sum(told) == 7
 
 
 def test_what_was_done_before_a_process_died_is_kept() -> None:
     """Catches results that are thrown away with the process that died after them."""
     kept = {}
-    with pytest.raises(WorkerError, match="a process that plays has died; accepted: the same command again"):
-        in_processes(_square, [1, 2, -1], 1, keep=kept.__setitem__, tick=lambda _: None)
+    with (
+        WorkerPool(2) as pool,
+        pytest.raises(WorkerError, match="a worker process has died; accepted: the same command again"),
+    ):
+        pool.run(_square, [1, 2, -1], keep=kept.__setitem__, tick=lambda _: None)
     assert kept == {1: 1, 2: 4}
