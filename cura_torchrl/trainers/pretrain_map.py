@@ -271,7 +271,7 @@ def _count_found(claimed: torch.Tensor, occupied: torch.Tensor, reach: float) ->
     """Return the numbers of occupied cells found, occupied cells, claimed cells that are right, claimed cells."""
     window = occupied.shape[-1]
     offset = torch.arange(window) - (window - 1) / 2
-    is_near = torch.hypot(offset[:, None], offset) <= reach
+    is_near = (offset[:, None] ** 2 + offset**2).sqrt() <= reach
     around_claimed = F.max_pool2d(claimed.float(), 3, 1, 1) > 0
     around_occupied = F.max_pool2d(occupied.float(), 3, 1, 1) > 0
     masks = (occupied & around_claimed, occupied, claimed & around_occupied, claimed)

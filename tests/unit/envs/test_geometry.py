@@ -199,3 +199,17 @@ def test_every_function_is_bitwise_independent_of_the_batch():
     for i in range(37):
         for one, batch in zip(everything(slice(i, i + 1)), whole, strict=True):
             assert torch.equal(one[0], batch[i])
+
+
+def test_an_inverse_is_that_of_lapack_and_the_same_in_every_batch():
+    """Catches a step of the elimination that reads what it has just written, and sums whose order is the batch's."""
+    factor = torch.rand(33, 10, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    matrix = factor @ factor.mT + 0.1 * torch.eye(10, dtype=torch.float64)
+    kept = matrix.clone()
+    inverse = geometry.inverse(matrix)
+    torch.testing.assert_close(inverse, torch.linalg.inv(matrix), rtol=1e-9, atol=1e-9)
+    assert torch.equal(matrix, kept)
+    for row in (0, 31):
+        assert torch.equal(geometry.inverse(matrix[row : row + 1])[0], inverse[row])
+    matrix[3] = 0.0
+    assert geometry.inverse(matrix).isfinite().all(-1).all(-1).tolist() == [row != 3 for row in range(33)]
