@@ -24,7 +24,7 @@ _Function = TypeVar("_Function", bound="Callable[..., Any]")
 
 
 def compiled(function: _Function) -> _Function:
-    """Compile a function on its first call, and keep the result for the next process.
+    """Compile a function on its first call, and keep the result for the next process where a folder can be written.
 
     Sums keep their order and functions their precision: what a row of a batch comes to must not depend on its
     neighbours in a vector.
@@ -35,8 +35,13 @@ def compiled(function: _Function) -> _Function:
     Returns:
         The compiled function, which runs without Python's lock.
     """
-    precise = {"nnan", "ninf", "nsz", "contract"}
-    return numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=precise)(function)  # type: ignore[return-value]
+    compiles = functools.partial(
+        numba.njit, nogil=True, error_model="numpy", fastmath={"nnan", "ninf", "nsz", "contract"}
+    )
+    try:
+        return compiles(cache=True)(function)  # type: ignore[return-value]
+    except RuntimeError:  # neither the package's folder nor the home can be written
+        return compiles(cache=False)(function)  # type: ignore[return-value]
 
 
 def fused(function: _Function) -> _Function:

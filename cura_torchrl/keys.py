@@ -79,9 +79,10 @@ With ``CURAConfig.uncertainty = "perceptual"`` that of the perceptual atoms.
 """
 
 OBSTACLE_CODE = "obstacle_code"
-"""True obstacles for an estimator that sees all of them, shape ``[*, 24]``; see ``trainers.privileged.ObstacleCode``.
+"""True obstacles for an estimator that sees all of them, shape ``[*, 24]``.
 
-Privileged: emitted while training with ``CURAConfig.uncertainty = "perceptual"`` only.
+See :class:`~cura_torchrl.envs.transforms.ObstacleCode`. Privileged: emitted while training with
+``CURAConfig.uncertainty = "perceptual"`` only.
 """
 PRIVILEGED_ATOMS = "privileged_atoms"
 """Atoms of the collision possibility C given the full state s, unsorted, shape ``[*, N]``."""

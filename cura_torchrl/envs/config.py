@@ -6,10 +6,11 @@ prints it.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass, field
 from typing import Literal, get_args
+
+from cura_torchrl.validation import require, require_fields
 
 ScenarioKind = Literal["uniform", "adversarial", "mixed"]
 Stream = Literal["train", "eval", "vae"]
@@ -18,51 +19,6 @@ RobotName = Literal["ridgeback_franka", "ridgeback"]
 
 STREAMS: tuple[Stream, ...] = get_args(Stream)
 """Streams of scenarios; the number of each keys its draws."""
-
-
-def require(condition: bool, what: str, value: object, accepted: str) -> None:
-    """Raise a one-line error unless a configuration value is acceptable.
-
-    Args:
-        condition: Whether the value is acceptable.
-        what: Name of the field.
-        value: The value that was given.
-        accepted: The values that are accepted, in words.
-
-    Raises:
-        ValueError: If ``condition`` is false.
-
-    Examples:
-        >>> require(-1 > 0, "episode_time", -1, "a positive number of seconds")
-        Traceback (most recent call last):
-        ValueError: episode_time is -1; accepted: a positive number of seconds
-    """
-    if not condition:
-        msg = f"{what} is {value!r}; accepted: {accepted}"
-        raise ValueError(msg)
-
-
-def require_finite(config: object) -> None:
-    """Raise unless every number in a dataclass, nested tuples included, is finite.
-
-    Args:
-        config: A dataclass instance; a number in it that is NaN or infinite is refused with a ValueError.
-
-    Examples:
-        >>> require_finite(LidarConfig())
-    """
-    for item in dataclasses.fields(config):  # type: ignore[arg-type]
-        value = getattr(config, item.name)
-        for number in _numbers(value):
-            require(math.isfinite(number), f"{type(config).__name__}.{item.name}", value, "finite numbers")
-
-
-def _numbers(value: object) -> list[float]:
-    if isinstance(value, float):
-        return [value]
-    if isinstance(value, tuple):
-        return [number for entry in value for number in _numbers(entry)]
-    return []
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +69,7 @@ class ScenarioConfig:
     """Offset of the object's centre of mass along each axis, a share of the edge, uniform in plus or minus this [1]."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         require(0 <= self.max_obstacles <= 6, "max_obstacles", self.max_obstacles, "0 to 6")
         require(self.num_fallbacks >= 1, "num_fallbacks", self.num_fallbacks, "1 or more")
         for name in ("object_edges", "obstacle_edges"):
@@ -124,6 +80,9 @@ class ScenarioConfig:
             require(low <= high, name, (low, high), "a range whose first number is not the larger one")
         for name in ("object_mass", "floor_friction"):
             require(getattr(self, name)[0] > 0, name, getattr(self, name), "positive numbers")
+        for name in ("obstacle_clearance", "obstacle_gap", "adversarial_jitter"):
+            require(getattr(self, name) >= 0, name, getattr(self, name), "a length that is not negative [m]")
+        require(0 <= self.com_shift < 0.5, "com_shift", self.com_shift, "0 to below 0.5, inside of the object")
 
 
 _RANGES = (
@@ -162,7 +121,7 @@ class RewardConfig:
     """Below this distance the direction to the goal counts as zero [m]."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         require(self.max_speed > 0, "max_speed", self.max_speed, "a positive speed [m/s]")
 
 
@@ -196,7 +155,7 @@ class TaskConfig:
     """Steps (frames, K): from this many frames on, at most K obstacles; if empty, always ``scenario.max_obstacles``."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         require(self.policy_period > 0, "policy_period", self.policy_period, "a positive time [s]")
         require(self.success_time >= 0, "success_time", self.success_time, "a time that is not negative [s]")
         least = self.policy_period
@@ -277,11 +236,18 @@ class RobotConfig:
     """Largest angular speed of the hand's orientation task, per axis [rad/s]."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
-        for name in ("max_base_speed", "max_base_yaw_rate", "max_tcp_speed", "ik_damping", "ik_rate"):
+        require_fields(self)
+        for name in _POSITIVE:
             require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
         gains = (self.stiffness, self.damping)
         require(all(len(gain) == 7 for gain in gains), "stiffness, damping", gains, "7 each")
+        require(min(map(min, gains)) > 0, "stiffness, damping", gains, "positive numbers")
+
+
+_POSITIVE = (
+    "max_base_speed", "max_base_yaw_rate", "max_base_acceleration", "max_base_yaw_acceleration", "max_tcp_speed",
+    "ik_damping", "ik_rate", "base_time_constant",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -300,7 +266,7 @@ class LidarConfig:
     """Whether rays see the pushed object; off, they pass through it."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         require(8 <= self.num_rays <= 8192, "num_rays", self.num_rays, "8 to 8192")
         lengths = (self.max_range, self.noise)
         require(self.max_range > 0 and self.noise >= 0, "max_range, noise", lengths, "positive, not negative [m]")
@@ -324,7 +290,7 @@ class MapConfig:
     """What the window holds: M and O; M times O; or M alone (the letter of the paper's Eq. 2)."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         require(0.0 <= self.decay <= 1.0, "decay", self.decay, "0 to 1")
         size = (self.resolution, self.window)
         require(min(size) > 0, "resolution, window", size, "positive numbers")
@@ -360,9 +326,10 @@ class PhysicsConfig:
     thousands. On the CPU it changes nothing."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         for name in ("control_period", "planar_period"):
             require(getattr(self, name) > 0, name, getattr(self, name), "a positive time [s]")
+        require(self.gravity > 0, "gravity", self.gravity, "a positive acceleration [m/s^2]")
         require(self.planar_sweeps >= 1, "planar_sweeps", self.planar_sweeps, "1 or more")
 
 
@@ -382,7 +349,12 @@ class PushEnvConfig:
     """Which simulator runs the worlds: PyBullet, the reference; or tensors in the plane, for speed."""
 
     def __post_init__(self) -> None:
+        require_fields(self)
         for name in ("control_period", "planar_period"):
             period = getattr(self.physics, name)
             ticks = self.task.policy_period / period
             require(abs(ticks - round(ticks)) < 1e-6, name, period, "a divisor of policy_period")
+        if self.simulator == "planar":
+            least = min(*self.task.scenario.object_edges, *self.task.scenario.obstacle_edges)
+            accepted = f"below the lowest cube's {least} m, for a plane has no heights"
+            require(self.lidar.height < least, "height of the planar simulator's LiDAR", self.lidar.height, accepted)

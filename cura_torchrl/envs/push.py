@@ -34,6 +34,8 @@ class PushEnv(EnvBase):
     Every key it reads and writes is described in :mod:`cura_torchrl.keys`. A row plays the scenarios
     ``first_episode + row``, then every ``episode_stride``-th: which scene an episode is never depends on batch size,
     worker count or the order of resets. ``set_seed`` begins this sequence again, with the scenes of the new seed.
+    Processes without seeds of their own play the same scenes: worker w of W gets ``first_episode=w * N`` and
+    ``episode_stride=W * N``. A row that is stepped after its end, rather than reset, stands still.
 
     Args:
         num_envs: Number of worlds N.
@@ -140,7 +142,8 @@ class PushEnv(EnvBase):
         self._obstacle_active, self._obstacle_pose = zeros(slots, dtype=torch.bool), zeros(slots, 3)
         self._elapsed, self._age, self._episode = (zeros(dtype=torch.int64) for _ in range(3))
         self._since_success = zeros(dtype=torch.int64) - 1
-        self._success, self._tipped = zeros(len(self.config.task.tolerances), dtype=torch.bool), zeros(dtype=torch.bool)
+        self._success = zeros(len(self.config.task.tolerances), dtype=torch.bool)
+        self._tipped, self._is_over = (zeros(dtype=torch.bool) for _ in range(2))
         self._previous_action = zeros(self._robot.action_size, dtype=torch.float32)
         self._terms = zeros(len(REWARD_TERM_NAMES), dtype=torch.float32)
         self._state: WorldState | None = None
@@ -218,6 +221,7 @@ class PushEnv(EnvBase):
         self._success[rows] = False
         self._tipped[rows] = False
         self._previous_action[rows] = 0.0
+        self._is_over[rows] = False
         self._terms[rows] = 0.0
         self._age[rows] = 0
         first = rows[self._is_first[rows]]
@@ -279,6 +283,7 @@ class PushEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = checked_action(tensordict[keys.ACTION], self._previous_action.shape, self._home)
+        action = action.masked_fill(self._is_over[:, None], 0.0)
         before = self.world_state
         to_object = geometry.to_frame(before.base_pose, before.object_position[:, :2])
         self._controller.command(action, to_object, self._worlds.mass_matrix())
@@ -295,8 +300,8 @@ class PushEnv(EnvBase):
             elapsed_steps=self._elapsed + self._age,
             steps_since_success=self._since_success,
         )
-        self._previous_action = action.float()
-        ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+        self._previous_action, self._is_over = action.float(), terminated | truncated
+        ends = {"terminated": terminated, "truncated": truncated, "done": self._is_over}
         columns = {name: flag[:, None] for name, flag in ends.items()}
         return self._emit().update({keys.REWARD: reward, keys.COST: cost, **columns})
 

@@ -169,10 +169,10 @@ class MapVAE(nn.Module):
         """Return the code that is fed to policies, as :meth:`encode`.
 
         Args:
-            maps: Maps in [0, 1], shape ``[B, C, W, W]``.
+            maps: Maps in [0, 1], shape ``[*, C, W, W]``.
 
         Returns:
-            Codes, shape ``[B, L]``.
+            Codes, shape ``[*, L]``.
         """
         return self.encode(maps)
 
@@ -180,10 +180,10 @@ class MapVAE(nn.Module):
         """Return the mean of the code's distribution.
 
         Args:
-            maps: Maps in [0, 1], shape ``[B, C, W, W]``.
+            maps: Maps in [0, 1], shape ``[*, C, W, W]``.
 
         Returns:
-            Codes, shape ``[B, L]``.
+            Codes, shape ``[*, L]``.
         """
         weight, bias = self.statistics_head.weight, self.statistics_head.bias
         return F.linear(self._features(maps), weight[: self.latent_size], bias[: self.latent_size])
@@ -192,10 +192,10 @@ class MapVAE(nn.Module):
         """Return mean and log-variance of the code's distribution.
 
         Args:
-            maps: Maps in [0, 1], shape ``[B, C, W, W]``.
+            maps: Maps in [0, 1], shape ``[*, C, W, W]``.
 
         Returns:
-            Mean and logarithm of the variance, both of shape ``[B, L]``.
+            Mean and logarithm of the variance, both of shape ``[*, L]``.
         """
         mean, log_variance = self.statistics_head(self._features(maps)).chunk(2, -1)
         return mean, log_variance
@@ -249,7 +249,8 @@ class MapVAE(nn.Module):
         return vae.eval()
 
     def _features(self, maps: torch.Tensor) -> torch.Tensor:
-        return self.trunk(maps.contiguous(memory_format=torch.channels_last))
+        rows = maps.reshape(-1, *maps.shape[-3:]).contiguous(memory_format=torch.channels_last)
+        return self.trunk(rows).view(*maps.shape[:-3], -1)
 
 
 class _Tiles(nn.Module):

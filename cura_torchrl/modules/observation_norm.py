@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import nn
 
+from cura_torchrl.validation import require_positive
+
 
 class ObservationNorm(nn.Module):
     """Normalises features to mean 0 and standard deviation 1 by the statistics of all batches given to :meth:`update`.
@@ -41,10 +43,7 @@ class ObservationNorm(nn.Module):
 
     def __init__(self, num_features: int, *, clip: float = 10.0, min_std: float = 0.01) -> None:
         super().__init__()
-        for name, value in (("num_features", num_features), ("clip", clip), ("min_std", min_std)):
-            if not value > 0:
-                msg = f"{name} is {value}; accepted: a positive number"
-                raise ValueError(msg)
+        require_positive(num_features=num_features, clip=clip, min_std=min_std)
         self.clip = clip
         self.min_std = min_std
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))

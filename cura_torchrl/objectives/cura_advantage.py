@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
@@ -24,6 +25,7 @@ from cura_torchrl.objectives.functional import (
 )
 from cura_torchrl.objectives.rollout import MASK, cut_at_padding, read_mask, require_keys
 from cura_torchrl.objectives.seeded import SeededModule
+from cura_torchrl.validation import require_choice, require_finite, require_positive, require_unit
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
@@ -155,11 +157,12 @@ class CURAAdvantage(SeededModule, TensorDictModuleBase):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        _require_unit(gamma=gamma, lmbda=lmbda, collision_gamma=collision_gamma, collision_lmbda=collision_lmbda)
-        _require_unit(cost_lmbda=cost_lmbda)
-        _require_positive(risk_floor=risk_floor, uncertainty_floor=uncertainty_floor, cost_clip=cost_clip)
-        _require_choice("advantage_scale", advantage_scale, get_args(AdvantageScale))
-        _require_choice("cost_baseline", cost_baseline, get_args(CostBaseline))
+        require_unit(gamma=gamma, lmbda=lmbda, collision_gamma=collision_gamma, collision_lmbda=collision_lmbda)
+        require_unit(cost_lmbda=cost_lmbda)
+        require_finite(risk_coeff=risk_coeff, uncertainty_coeff=uncertainty_coeff)
+        require_positive(risk_floor=risk_floor, uncertainty_floor=uncertainty_floor, cost_clip=cost_clip)
+        require_choice("advantage_scale", advantage_scale, get_args(AdvantageScale))
+        require_choice("cost_baseline", cost_baseline, get_args(CostBaseline))
         self.value_estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=critic_network)
         self.collision_network = collision_network
         self.collision_gamma = collision_gamma
@@ -180,10 +183,16 @@ class CURAAdvantage(SeededModule, TensorDictModuleBase):
     def __setattr__(self, name: str, value: Any) -> None:
         """Copy numbers assigned to a coefficient into its buffer; set all else as usual."""
         buffer = self.__dict__.get("_buffers", {}).get(name)
-        if buffer is not None and isinstance(value, (int, float)):
-            buffer.fill_(value)
+        if buffer is not None and isinstance(value, numbers.Real):
+            require_finite(**{name: float(value)})
+            buffer.fill_(float(value))
         else:
             super().__setattr__(name, value)
+
+    def _apply(self, fn: Any, recurse: bool = True) -> CURAAdvantage:
+        # TorchRL's estimator hides its network from PyTorch: it would be left where and as it was.
+        self.value_estimator.value_network._apply(fn)
+        return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
 
     def set_keys(self, **kwargs: NestedKey) -> None:
         """Change the keys that are read and written.
@@ -231,12 +240,16 @@ class CURAAdvantage(SeededModule, TensorDictModuleBase):
             The same tensordict.
 
         Raises:
-            KeyError: If the rollout or the collision network lacks a key; nothing has been written then.
+            KeyError: If the rollout or a network lacks a key; nothing has been written then.
+            ValueError: If a dimension is named time and is not the last one.
         """  # noqa: DOC502 - raised by what this calls
         names = self.tensor_keys
         require_keys(self.in_keys, tensordict.keys(True, True), "rollouts that hold it, or another key by set_keys")
         written = (names.collision_atoms, names.risk, names.uncertainty)
-        require_keys(written, self.collision_network.out_keys, "networks that write it, or another key by set_keys")
+        networks = "networks that write it, or another key by set_keys"
+        require_keys(written, self.collision_network.out_keys, networks)
+        require_keys([names.value], self.value_estimator.value_network.out_keys, networks)
+        _require_time_last(tensordict)
         self._estimate_advantage(tensordict)
         self._estimate(tensordict)
         next_atoms = self._estimate(tensordict.get("next"))
@@ -335,7 +348,7 @@ class CURAAdvantage(SeededModule, TensorDictModuleBase):
         raw_uncertainty = accumulate(raw_uncertainty.masked_fill(~uncertainty_mask, 0.0), cut, factor)
         if self.cost_baseline == "state":
             seen = [*map(tensordict.get, self.collision_network.in_keys), risk, tensordict.get(names.uncertainty)]
-            features = torch.cat(seen, -1)
+            features = torch.cat([part.reshape(*tensordict.batch_size, -1) for part in seen], -1)
             raw_risk = raw_risk - explain(raw_risk, features, risk_mask)
             raw_uncertainty = raw_uncertainty - explain(raw_uncertainty, features, uncertainty_mask)
         return _Costs(
@@ -373,21 +386,7 @@ def _next(key: NestedKey) -> tuple[str, ...]:
     return ("next", key) if isinstance(key, str) else ("next", *key)
 
 
-def _require_choice(name: str, value: str, accepted: tuple[str, ...]) -> None:
-    if value not in accepted:
-        msg = f"{name} is {value!r}; accepted: {', '.join(map(repr, accepted))}"
+def _require_time_last(tensordict: TensorDictBase) -> None:
+    if "time" in tensordict.names[:-1]:
+        msg = f"dimensions are {tensordict.names}; accepted: time as the last one"
         raise ValueError(msg)
-
-
-def _require_unit(**values: float) -> None:
-    for name, value in values.items():
-        if not 0.0 <= value <= 1.0:
-            msg = f"{name} is {value}; accepted: 0 to 1"
-            raise ValueError(msg)
-
-
-def _require_positive(**values: float) -> None:
-    for name, value in values.items():
-        if not value > 0.0:
-            msg = f"{name} is {value}; accepted: a positive number"
-            raise ValueError(msg)

@@ -51,7 +51,11 @@ def energy_distance(prediction: torch.Tensor, target: torch.Tensor) -> torch.Ten
             "accepted: the same leading shape and at least one atom each"
         )
         raise ValueError(msg)
-    if prediction.device.type == "cpu" and not torch.compiler.is_compiling():
+    if prediction.dtype.itemsize < 4 or target.dtype.itemsize < 4:
+        # Half precision has neither the range nor the digits of the sums.
+        return energy_distance(prediction.float(), target.float()).to(prediction.dtype)
+    is_traced = torch.compiler.is_compiling() or torch._C._functorch.maybe_current_level() is not None
+    if prediction.device.type == "cpu" and not is_traced:
         distance: torch.Tensor = _EnergyDistance.apply(prediction, target)  # type: ignore[no-untyped-call]
         return distance
     merged = torch.cat([prediction, target], -1)
@@ -69,7 +73,7 @@ def _sorted_weights(merged: torch.Tensor, num_x: int, num_y: int) -> torch.Tenso
     steps = torch.cat([merged.new_full((num_x,), num_y), merged.new_full((num_y,), -num_x)])
     sorted_steps = steps.expand_as(merged).gather(-1, order)
     sorted_weights = (sorted_steps - 2.0 * sorted_steps.cumsum(-1)) * sorted_steps * (2.0 / (num_x * num_y) ** 2)
-    return torch.empty_like(merged).scatter_(-1, order, sorted_weights)
+    return torch.empty_like(merged).scatter(-1, order, sorted_weights)
 
 
 class _EnergyDistance(torch.autograd.Function):

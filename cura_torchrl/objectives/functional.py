@@ -176,6 +176,8 @@ def accumulate(values: torch.Tensor, done: torch.Tensor, factor: float) -> torch
 def explain(values: torch.Tensor, features: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
     """Return what a linear regression on features makes of values: a baseline that knows the state and no action.
 
+    With fewer samples than twice the features a regression fits the noise: then it is the mean.
+
     Args:
         values: What to explain, shape ``[*B, 1]``.
         features: Numbers that describe the state, shape ``[*B, F]``.
@@ -188,9 +190,9 @@ def explain(values: torch.Tensor, features: torch.Tensor, mask: torch.Tensor | N
         Greensmith, Bartlett and Baxter (2004), "Variance reduction techniques for gradient estimates": baselines.
 
     Examples:
-        >>> state = torch.tensor([[0.0], [1.0], [2.0]])
+        >>> state = torch.tensor([[0.0], [1.0], [2.0], [3.0]])
         >>> explain(3.0 * state + 1.0, state).flatten().round(decimals=3).tolist()
-        [1.0, 4.0, 7.0]
+        [1.0, 4.0, 7.0, 10.0]
     """
     inside = torch.ones_like(values, dtype=torch.bool) if mask is None else mask
     weight = inside.reshape(-1, 1).double()
@@ -202,7 +204,9 @@ def explain(values: torch.Tensor, features: torch.Tensor, mask: torch.Tensor | N
     # The ridge keeps features that follow from others, or never change, from blowing up.
     ridge = _RIDGE * count * torch.eye(rows.shape[-1], dtype=rows.dtype, device=rows.device)
     weights = torch.linalg.solve(rows.T @ rows + ridge, rows.T @ target)
-    return (rows @ weights).reshape(values.shape).to(values.dtype)
+    is_enough = count >= 2 * rows.shape[-1]
+    explained = torch.where(is_enough, rows @ weights, weight * target.sum() / count)
+    return explained.reshape(values.shape).to(values.dtype)
 
 
 def normalise(values: torch.Tensor, *, floor: float, clip: float, mask: torch.Tensor | None = None) -> torch.Tensor:

@@ -18,10 +18,9 @@ from cura_torchrl.envs.config import (
     RobotName,
     ScenarioKind,
     Simulator,
-    require,
-    require_finite,
 )
 from cura_torchrl.trainers.decoding import decode, encode
+from cura_torchrl.validation import require, require_fields
 
 LoggerKind = Literal["csv", "tensorboard", "wandb"]
 ScriptedKind = Literal["scripted", "avoider", "random"]
@@ -71,7 +70,7 @@ class PPOConfig:
     """Factor by which the learning rate rises or falls when the KL divergence is off by more than two [1]."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         for name in ("gamma", "lmbda"):
             require(0.0 <= getattr(self, name) <= 1.0, name, getattr(self, name), "0 to 1")
         for name in (
@@ -139,7 +138,7 @@ class CURAConfig:
     """Norm that the estimator's gradient is clipped to [1]."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         for name in ("gamma", "lmbda", "cost_lmbda"):
             require(0.0 <= getattr(self, name) <= 1.0, name, getattr(self, name), "0 to 1")
         for name in ("num_atoms", "risk_floor", "uncertainty_floor", "cost_clip", "lr", "max_grad_norm"):
@@ -168,7 +167,7 @@ class NetworkConfig:
     """What the standard deviation of the normalised action stays above [1]."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         for name in ("actor_hidden_sizes", "critic_hidden_sizes", "collision_hidden_sizes"):
             sizes = getattr(self, name)
             require(bool(sizes) and min(sizes, default=0) > 0, name, sizes, "one or more positive sizes")
@@ -226,7 +225,7 @@ class TrainConfig:
     """Network sizes."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         for name in (
             "num_envs",
             "num_workers",
@@ -346,7 +345,7 @@ class EvaluateConfig:
     """Episodes that a process plays side by side [1]."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         given = [value for value in (self.checkpoint, self.method, self.policy) if value is not None]
         require(
             len(given) == 1, "policy to evaluate", [str(value) for value in given], "one of checkpoint, method, policy"

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from cura_torchrl import keys
-from cura_torchrl.envs.config import require
 from cura_torchrl.trainers.build import LATENT_SIZE, make_env
 from cura_torchrl.trainers.methods import method as preset
+from cura_torchrl.validation import require
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,10 +1,12 @@
-"""What is made into few kernels on a GPU does what is written."""
+"""What is compiled does what is written: few kernels on a GPU, loops on the CPU."""
 
 from __future__ import annotations
 
+import numba
 import pytest
 import torch
 
+from cura_torchrl.compiled import compiled
 from cura_torchrl.envs.sensors import MapGrid, map_tensors, noise, window
 from cura_torchrl.envs.simulation import rays
 
@@ -90,3 +92,18 @@ def test_a_gpu_fuses_to_what_is_written(play, function):
         torch.manual_seed(0)
         is_same = (play(function, rows, "cuda").cpu() - expected).abs() < 1e-5
         assert is_same.float().mean() > 0.999
+
+
+def test_without_a_folder_to_write_functions_are_compiled_anew(monkeypatch):
+    """Catches an import that fails in a container whose user can write neither the package's folder nor a home."""
+    njit = numba.njit
+
+    def nowhere(*, cache, **options):
+        def refuse(function):
+            msg = f"cannot cache function {function.__name__!r}: no locator available"
+            raise RuntimeError(msg)
+
+        return refuse if cache else njit(cache=False, **options)
+
+    monkeypatch.setattr(numba, "njit", nowhere)
+    assert compiled(lambda number: number + 1)(1) == 2

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 
 def checked_action(action: torch.Tensor, shape: torch.Size, device: torch.device) -> torch.Tensor:
@@ -35,7 +40,7 @@ def checked_action(action: torch.Tensor, shape: torch.Size, device: torch.device
     return action
 
 
-def checked_episodes(episodes: torch.Tensor, num_envs: int, device: torch.device) -> torch.Tensor:
+def checked_episodes(episodes: torch.Tensor | Sequence[int], num_envs: int, device: torch.device) -> torch.Tensor:
     """Return the episodes that rows are asked to play.
 
     Args:
@@ -53,6 +58,7 @@ def checked_episodes(episodes: torch.Tensor, num_envs: int, device: torch.device
         >>> checked_episodes(torch.tensor([[3], [7]]), 2, torch.device("cpu")).tolist()
         [3, 7]
     """
+    episodes = torch.as_tensor(episodes)
     is_integer = not (episodes.is_floating_point() or episodes.is_complex() or episodes.dtype == torch.bool)
     if not is_integer or episodes.numel() != num_envs or bool((episodes < 0).any()):
         msg = f"episodes are {episodes.tolist()}; accepted: {num_envs} integers, 0 or more, one for each row"

@@ -15,7 +15,8 @@ import torch
 from tensordict import TensorDict
 
 from cura_torchrl.envs import geometry
-from cura_torchrl.envs.config import STREAMS, require
+from cura_torchrl.envs.config import STREAMS
+from cura_torchrl.validation import require
 
 if TYPE_CHECKING:
     from cura_torchrl.envs.config import ScenarioConfig, Stream

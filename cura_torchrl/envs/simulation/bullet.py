@@ -71,6 +71,18 @@ class BulletWorlds:
         self._contact = np.zeros((num_worlds, 3), dtype=bool)
         self._joint_state = np.zeros((num_worlds, 2, len(joints)))
 
+    def __reduce__(self) -> str:
+        """Refuse to be copied or pickled: Bullet's worlds would be shared with the copy.
+
+        Raises:
+            TypeError: Always.
+        """
+        msg = (
+            "PyBullet's worlds cannot be copied, or sent to another process; accepted: to make them there, with"
+            " functools.partial(PushEnv, ...)"
+        )
+        raise TypeError(msg)
+
     def close(self) -> None:
         """Disconnect every client; harmless when done twice."""
         for client in self._clients:

@@ -15,11 +15,12 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import Transform
 
 from cura_torchrl import keys
-from cura_torchrl.envs.config import MapConfig, require
+from cura_torchrl.envs.config import MapConfig
 from cura_torchrl.envs.sensors import map_kernels, map_tensors, visibility, window
 from cura_torchrl.envs.sensors.lidar import ray_angles
 from cura_torchrl.envs.sensors.visibility import MapGrid
 from cura_torchrl.envs.transforms.reset_mask import reset_mask
+from cura_torchrl.validation import require
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

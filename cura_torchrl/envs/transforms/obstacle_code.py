@@ -11,6 +11,7 @@ from torchrl.envs.transforms import Transform
 from cura_torchrl import keys
 from cura_torchrl.envs.geometry import to_frame
 from cura_torchrl.envs.mdp.scenarios import OBSTACLE_SLOTS
+from cura_torchrl.validation import require
 
 if TYPE_CHECKING:
     from tensordict import NestedKey, TensorDictBase
@@ -40,9 +41,13 @@ class ObstacleCode(Transform):
         size: Length of the code, at least 24 unless ``is_blind`` [1].
         is_blind: Whether the code is zero.
         out_key: Key of the code.
+
+    Raises:
+        ValueError: If ``size`` is too small for the obstacles.
     """
 
     def __init__(self, size: int, *, is_blind: bool, out_key: NestedKey = keys.LATENT) -> None:
+        require(is_blind or size >= CODE_SIZE, "size", size, f"{CODE_SIZE} or more")
         in_keys = [keys.SENSOR_POSE] if is_blind else [keys.SENSOR_POSE, keys.OBSTACLES]
         super().__init__(in_keys=in_keys, out_keys=[out_key])
         self.size = size

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from torchrl.envs.transforms.utils import _get_reset
 
-from cura_torchrl.envs.config import require
+from cura_torchrl.validation import require
 
 if TYPE_CHECKING:
     import torch

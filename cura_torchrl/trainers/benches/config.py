@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 
 import tyro
 
-from cura_torchrl.envs.config import require, require_finite
+from cura_torchrl.validation import require, require_fields
 
 BenchTarget: TypeAlias = Literal["env", "learner", "lidar", "ik", "peers"]
 
@@ -48,7 +48,7 @@ class BenchConfig:
     """Seed of scenarios, actions and networks [1]."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         for name in ("rounds", "steps", "num_envs", "num_workers", "planar_envs", "peer_envs", "maps", "batch_size"):
             require(getattr(self, name) >= 1, name, getattr(self, name), "1 or more")
         require(all(count >= 1 for count in self.sweep), "sweep", self.sweep, "1 or more each")

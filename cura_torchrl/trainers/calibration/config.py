@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from cura_torchrl.envs.config import Simulator, require, require_finite
+from cura_torchrl.envs.config import Simulator
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.lists import require_known, split_names
+from cura_torchrl.validation import require, require_fields
 
 CONDITIONS: dict[str, dict[str, Any]] = {
     "on-policy": {},
@@ -52,7 +53,7 @@ class CalibrateConfig:
     """Folder for ``calibration.json``, ``calibration.md`` and the figures."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         for name in ("methods", "conditions"):
             object.__setattr__(self, name, split_names(getattr(self, name)))
             require(bool(getattr(self, name)), name, getattr(self, name), "one or more")

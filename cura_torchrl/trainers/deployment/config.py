@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from cura_torchrl.envs.config import require
 from cura_torchrl.trainers.methods import method
+from cura_torchrl.validation import require
 
 
 @dataclass(frozen=True, kw_only=True)

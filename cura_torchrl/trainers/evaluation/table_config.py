@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast, get_args
 
-from cura_torchrl.envs.config import ScenarioKind, Simulator, require, require_finite
+from cura_torchrl.envs.config import ScenarioKind, Simulator
 from cura_torchrl.trainers.evaluation.paper_table import PAPER_CELLS
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.lists import Numbers, require_known, split_names
 from cura_torchrl.trainers.methods import PRESETS
+from cura_torchrl.validation import require, require_fields
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -94,7 +95,7 @@ class TableConfig:
     """File of outcomes, of this or the other simulator: tells how many of the same scenes ended alike."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         object.__setattr__(self, "methods", split_names(self.methods))
         object.__setattr__(self, "cells", tuple(cell.name for cell in _cells(split_names(self.cells))))
         require(bool(self.methods), "methods", self.methods, "one or more methods")

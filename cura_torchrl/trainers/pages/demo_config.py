@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from cura_torchrl.envs.config import Simulator, require, require_finite
+from cura_torchrl.envs.config import Simulator
+from cura_torchrl.validation import require, require_fields
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +44,7 @@ class DemoConfig:
     """Whether the page is opened in the web browser in the end."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         for name in ("scenes", "frame_stride", "train_envs", "num_workers"):
             require(getattr(self, name) > 0, name, getattr(self, name), "1 or more")
         for name in ("telling_scenes", "train_iterations"):

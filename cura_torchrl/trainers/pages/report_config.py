@@ -7,7 +7,8 @@ from pathlib import Path
 
 import tyro
 
-from cura_torchrl.envs.config import ScenarioKind, Simulator, require, require_finite
+from cura_torchrl.envs.config import ScenarioKind, Simulator
+from cura_torchrl.validation import require, require_fields
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +44,7 @@ class ReportConfig:
     """Policy steps between two frames of the animation [1]."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         require(bool(self.runs), "runs", self.runs, "one or more methods or folders")
         require(0.3 <= self.object_size <= 1.2, "object_size", self.object_size, "0.3 to 1.2 m")
         require(0 <= self.max_obstacles <= 6, "max_obstacles", self.max_obstacles, "0 to 6")

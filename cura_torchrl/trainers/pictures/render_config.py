@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from cura_torchrl.envs.config import ScenarioKind, Simulator, require, require_finite
+from cura_torchrl.envs.config import ScenarioKind, Simulator
 from cura_torchrl.trainers.info import shipped_methods
 from cura_torchrl.trainers.lists import require_known, split_names
+from cura_torchrl.validation import require, require_fields
 
 FigureName = Literal["paths", "snapshots", "distribution", "appearance", "layout"]
 """Figures of the paper: paths; paths with maps; the DCE's distribution; how an obstacle appears; the environment."""
@@ -61,7 +62,7 @@ class RenderConfig:
     """Folder for the files."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         for name in ("methods", "figures", "formats"):
             object.__setattr__(self, name, split_names(getattr(self, name)))
         self._require_names()

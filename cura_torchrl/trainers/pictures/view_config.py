@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cura_torchrl.envs.config import ScenarioKind, Simulator, require, require_finite
+from cura_torchrl.envs.config import ScenarioKind, Simulator
+from cura_torchrl.validation import require, require_fields
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +36,7 @@ class ViewConfig:
     """Port that serves the view [1]; the next free one where it is taken."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         require(0.3 <= self.object_size <= 1.2, "object_size", self.object_size, "0.3 to 1.2 m")
         require(0 <= self.max_obstacles <= 6, "max_obstacles", self.max_obstacles, "0 to 6")
         require(self.speed > 0.0, "speed", self.speed, "a positive number")

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from cura_torchrl.envs.config import Simulator, require, require_finite
+from cura_torchrl.envs.config import Simulator
 from cura_torchrl.trainers.config import Perception, TrainConfig
 from cura_torchrl.trainers.methods import method
+from cura_torchrl.validation import require, require_fields
 
 Expert = Literal["scripted", "avoider"]
 
@@ -50,7 +51,7 @@ class ImitateConfig:
     """Seed of scenarios, networks and noise [1]."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         for name in ("num_envs", "rounds", "steps", "epochs", "minibatch_size", "lr", "std"):
             require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
         require(self.noise >= 0, "noise", self.noise, "a number that is not negative")

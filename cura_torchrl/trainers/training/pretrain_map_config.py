@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from cura_torchrl.envs.config import MapConfig, PushEnvConfig, Simulator, require, require_finite
+from cura_torchrl.envs.config import MapConfig, PushEnvConfig, Simulator
+from cura_torchrl.validation import require, require_fields
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +62,7 @@ class PretrainMapConfig:
     """Seed of scenarios, noise and networks."""
 
     def __post_init__(self) -> None:
-        require_finite(self)
+        require_fields(self)
         require(0.0 < self.map.decay < 1.0, "map.decay", self.map.decay, "between 0 and 1: ages are read from it")
         require(
             bool(self.decays) and all(0.0 <= decay <= 1.0 for decay in self.decays),

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cura_torchrl.envs.config import Simulator, require
+from cura_torchrl.envs.config import Simulator
 from cura_torchrl.trainers.config import TrainConfig
 from cura_torchrl.trainers.lists import Numbers, split_names
 from cura_torchrl.trainers.methods import method
+from cura_torchrl.validation import require
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

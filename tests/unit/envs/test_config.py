@@ -38,6 +38,13 @@ CONFIGS = (ScenarioConfig, RewardConfig, TaskConfig, RobotConfig, LidarConfig, M
         (TaskConfig, {"success_time": -1.0}),
         (TaskConfig, {"curriculum": ((10, 2), (5, 3))}),
         (TaskConfig, {"curriculum": ((0, 7),)}),
+        (ScenarioConfig, {"kind": "adverserial"}),
+        (ScenarioConfig, {"com_shift": 0.5}),
+        (ScenarioConfig, {"obstacle_clearance": -1.0}),
+        (TaskConfig, {"stream": "test"}),
+        (RobotConfig, {"model": "franka"}),
+        (RobotConfig, {"base_time_constant": 0.0}),
+        (RobotConfig, {"stiffness": (0.0,) * 7}),
         (RobotConfig, {"ik_damping": 0.0}),
         (RobotConfig, {"stiffness": (600.0,) * 6}),
         (LidarConfig, {"num_rays": 7}),
@@ -45,17 +52,28 @@ CONFIGS = (ScenarioConfig, RewardConfig, TaskConfig, RobotConfig, LidarConfig, M
         (LidarConfig, {"noise": -0.1}),
         (MapConfig, {"decay": 1.1}),
         (MapConfig, {"window": 0}),
+        (MapConfig, {"channels": "occupancy"}),
+        (PhysicsConfig, {"gravity": -9.81}),
+        (PushEnvConfig, {"simulator": "Planar"}),
         (PhysicsConfig, {"control_period": 0.0}),
         (PushEnvConfig, {"physics": PhysicsConfig(control_period=0.03)}),
     ],
 )
 def test_values_that_cannot_be_meant_are_refused_in_one_line(config: type, changes: dict[str, Any]):
     """Catches a check that was lost, and a message that does not name field, value and what is accepted."""
-    with pytest.raises(ValueError, match=r"^[\w, ]+ is .*; accepted: ") as error:
+    with pytest.raises(ValueError, match=r"^[\w, .]+ is .*; accepted: ") as error:
         config(**changes)
     assert "\n" not in str(error.value)
     names = [*changes, "control_period"]
     assert any(name in str(error.value) for name in names)
+
+
+def test_a_plane_has_no_lidar_above_its_cubes():
+    """Catches rays that hit, on the planar simulator, what they pass over on PyBullet."""
+    above = LidarConfig(height=0.45)
+    PushEnvConfig(lidar=above)
+    with pytest.raises(ValueError, match=r"LiDAR is 0\.45; accepted: below the lowest cube's 0\.4 m"):
+        PushEnvConfig(lidar=above, simulator="planar")
 
 
 @pytest.mark.parametrize("config", CONFIGS)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
+import pickle
 from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 
 from cura_torchrl.envs.config import LidarConfig, PushEnvConfig, RobotConfig, ScenarioConfig, TaskConfig
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
@@ -374,3 +377,31 @@ def test_misuse_is_told_in_one_line(make):
         PushEnv(0)
     with pytest.raises(RuntimeError, match=r"^the environment has not been reset; accepted: reset\(\) before"):
         _ = make(1).world_state
+
+
+def test_a_row_that_is_stepped_after_its_end_stands_still(make: Any) -> None:
+    """Catches a robot that drives through obstacles after a collision, until its LiDAR is inside of one."""
+    env = make(16, dataclasses.replace(make_config(120), simulator="planar"))
+    ahead = torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]).expand(16, 6)
+    policy = TensorDictModule(lambda _: ahead, in_keys=["observation"], out_keys=["action"])
+    rollout = env.rollout(120, policy, break_when_any_done=False, break_when_all_done=True)
+    collided = rollout["next", "terminated"][:, :-5].any(1).flatten()
+    assert collided.any()
+    speed = env.world_state.base_velocity[collided].norm(dim=-1)
+    assert (speed < 1e-3).all()
+
+
+def test_worlds_of_pybullet_are_not_copied(make: Any) -> None:
+    """Catches a copy that shares its worlds with the original, and whose controller moves nothing."""
+    env = make(1, make_config())
+    for copied in (copy.deepcopy, pickle.dumps):
+        with pytest.raises(TypeError, match=r"cannot be copied, .*; accepted: to make them there"):
+            copied(env)
+
+
+def test_a_list_of_episodes_is_as_good_as_a_tensor(make: Any) -> None:
+    """Catches an error about an attribute of lists."""
+    env = make(2, dataclasses.replace(make_config(), simulator="planar"))
+    assert env.reset(episodes=[7, 3])["episode"].flatten().tolist() == [7, 3]
+    with pytest.raises(ValueError, match=r"episodes are \[7\]; accepted: 2 integers"):
+        env.reset(episodes=[7])

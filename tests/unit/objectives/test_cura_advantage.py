@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -162,6 +163,33 @@ def test_a_baseline_takes_out_what_the_state_explains() -> None:
     assert by_baseline["mean"] > -0.5
 
 
+def test_a_baseline_does_not_learn_a_small_rollout_by_heart() -> None:
+    """Catches a regression on more numbers than samples: it explains all, and nothing is left of the costs."""
+    critic, estimator = _networks()
+    rollout = _rollout()[:1, :6]  # six samples of seven numbers each
+    small = {
+        name: CURAAdvantage(critic, estimator, cost_baseline=name)(rollout.clone())["advantage"]
+        for name in ("mean", "state")
+    }
+    torch.testing.assert_close(small["state"], small["mean"])
+    whole = {name: CURAAdvantage(critic, estimator, cost_baseline=name)(_rollout())["advantage"] for name in small}
+    assert (whole["state"] - whole["mean"]).abs().max() > 0.1
+
+
+def test_a_baseline_of_the_state_takes_observations_of_any_shape() -> None:
+    """Catches a concatenation that only vectors fit into."""
+
+    class Wide(nn.Module):
+        def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            return _Table()(image.flatten(-3)[..., :2].abs() + 0.1)
+
+    wide = TensorDictModule(Wide(), in_keys=["image"], out_keys=["collision_atoms", "risk", "uncertainty"])
+    rollout = _rollout()
+    rollout["image"], rollout["next", "image"] = torch.randn(2, ENVS, STEPS, 2, 2, 2).unbind(0)
+    critic, _ = _networks()
+    assert CURAAdvantage(critic, wide, cost_baseline="state")(rollout)["advantage"].isfinite().all()
+
+
 def test_the_sum_is_standardised_for_the_optimiser() -> None:
     """Catches a sum that keeps the scale of the reward, on which PPO's step size would depend."""
     critic, estimator = _networks()
@@ -232,6 +260,10 @@ def test_coefficients_can_be_set_and_are_saved() -> None:
     assert not torch.allclose(cold, warm)
     assert torch.equal(warm, CURAAdvantage(critic, estimator)(_rollout())["advantage"])
     assert estimate.state_dict()["risk_coeff"].item() == 0.25
+    estimate.risk_coeff = np.float32(0.5)
+    assert estimate.risk_coeff.item() == 0.5
+    with pytest.raises(ValueError, match="uncertainty_coeff is inf; accepted: a finite number"):
+        estimate.uncertainty_coeff = float("inf")
 
 
 def test_a_resumed_run_draws_the_same_targets() -> None:
@@ -316,6 +348,36 @@ def test_a_network_that_writes_other_keys_is_refused_before_anything_is_written(
     assert estimate(rollout)["collision_target"].shape == (ENVS, STEPS, 50)
 
 
+def test_a_critic_that_writes_another_key_is_refused_before_anything_is_written() -> None:
+    """Catches an error deep inside of TorchRL's estimator; set_keys tells the key."""
+    _, estimator = _networks()
+    estimate, rollout = CURAAdvantage(make_critic(5, hidden_sizes=(16,), out_key="v"), estimator), _rollout()
+    before = set(rollout.keys(True, True))
+    with pytest.raises(KeyError, match=r"'state_value' is missing; accepted: networks"):
+        estimate(rollout)
+    assert set(rollout.keys(True, True)) == before
+    estimate.set_keys(value="v")
+    assert estimate(rollout)["advantage"].isfinite().all()
+
+
+def test_time_that_is_not_the_last_dimension_is_refused() -> None:
+    """Catches a rollout half of which is read along time: GAE looks for the dimension's name."""
+    first = _rollout().transpose(0, 1).contiguous()
+    first.names = ["time", None]
+    with pytest.raises(ValueError, match=r"dimensions are \['time', None\]; accepted: time as the last one"):
+        CURAAdvantage(*_networks())(first)
+    last = _rollout()
+    last.names = [None, "time"]
+    assert CURAAdvantage(*_networks())(last)["advantage"].isfinite().all()
+
+
+def test_both_networks_move_with_it() -> None:
+    """Catches a critic that stays on its device and in its precision, for TorchRL hides it from PyTorch."""
+    estimate = CURAAdvantage(*_networks()).double()
+    rollout = _rollout().apply(lambda value: value.double() if value.is_floating_point() else value)
+    assert estimate(rollout)["advantage"].dtype == torch.float64
+
+
 def test_keys_can_be_nested() -> None:
     """Catches a hard-coded key anywhere between GAE, costs and targets."""
     critic, estimator = _networks()
@@ -391,6 +453,7 @@ def test_diagnostics_are_the_numbers_they_say() -> None:
         ({"collision_lmbda": -0.1}, "collision_lmbda is -0.1; accepted: 0 to 1"),
         ({"risk_floor": 0.0}, "risk_floor is 0.0; accepted: a positive number"),
         ({"advantage_scale": "none"}, "advantage_scale is 'none'; accepted: 'raw', 'zscore'"),
+        ({"risk_coeff": float("nan")}, "risk_coeff is nan; accepted: a finite number"),
     ],
 )
 def test_nonsense_is_refused(kwargs: dict[str, object], message: str) -> None:

@@ -49,6 +49,28 @@ def test_energy_distance_refuses_sets_that_do_not_fit() -> None:
             energy_distance(torch.zeros(3, 5), target)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_energy_distance_sums_half_precision_in_single(dtype: torch.dtype, generator: torch.Generator) -> None:
+    """Catches sums that leave the range of half precision: 50 atoms make steps of 247,500."""
+    one, other = (torch.rand(4, 50, generator=generator).to(dtype) + shift for shift in (0.0, 2.0))
+    one.requires_grad_()
+    distance = energy_distance(one, other)
+    assert distance.dtype == dtype
+    torch.testing.assert_close(distance.float(), energy_distance(one.float(), other.float()), rtol=1e-2, atol=1e-3)
+    distance.sum().backward()
+    assert one.grad.isfinite().all()
+
+
+def test_energy_distance_follows_transforms_of_functions(generator: torch.Generator) -> None:
+    """Catches a function of its own that vmap and grad cannot look into."""
+    one, other = torch.rand(2, 4, 50, generator=generator).unbind(0)
+    torch.testing.assert_close(torch.vmap(energy_distance)(one, other), energy_distance(one, other))
+    slope = torch.func.grad(lambda atoms: energy_distance(atoms, other).sum())(one)
+    expected = one.clone().requires_grad_()
+    energy_distance(expected, other).sum().backward()
+    torch.testing.assert_close(slope, expected.grad)
+
+
 def test_energy_distance_compiles_into_one_graph() -> None:
     """Catches a branch on data, which would break torch.compile's graph, and wrong tensor operations."""
     compiled = torch.compile(energy_distance, fullgraph=True, backend="eager")
