@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import sys
@@ -28,21 +29,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # PyTorch then takes huge pages for large tensors. It reads this once, when it makes the first one.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
     given = list(sys.argv[1:] if arguments is None else arguments)
-    if not given or given[0] in {"-h", "--help"}:
-        sys.stdout.write(_overview())
-        return 0
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    if given[0] not in COMMANDS:
-        return _complain(RunError(f"{given[0]!r} is no command; accepted: {', '.join(COMMANDS)}"), RunError.exit_code)
     try:
-        COMMANDS[given[0]](given[1:])
+        _run(given)
     except RunError as error:
         return _complain(error, error.exit_code)
     except OSError as error:
+        with contextlib.suppress(OSError):  # what could not be written would be told again at the end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _complain(error, RunError.exit_code)
     except KeyboardInterrupt:
         return 130
     return 0
+
+
+def _run(given: list[str]) -> None:
+    if sys.stdout is None:
+        raise RunError("standard output is closed; accepted: one that can be written, such as /dev/null")
+    if not given or given[0] in {"-h", "--help"}:
+        sys.stdout.write(_overview())
+    elif given[0] in COMMANDS:
+        COMMANDS[given[0]](given[1:])
+    else:
+        raise RunError(f"{given[0]!r} is no command; accepted: {', '.join(COMMANDS)}")
+    sys.stdout.flush()  # else it would be told after the end that nothing could be written
 
 
 def _complain(error: Exception, code: int) -> int:

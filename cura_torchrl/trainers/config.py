@@ -342,7 +342,7 @@ class EvaluateConfig:
     num_workers: int = 1
     """Processes that play [1]; results do not depend on it."""
     chunk: int = 20
-    """Episodes that a process plays side by side [1]."""
+    """Episodes that a process plays side by side [1]; results do not depend on it."""
 
     def __post_init__(self) -> None:
         require_fields(self)

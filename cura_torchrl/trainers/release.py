@@ -69,7 +69,9 @@ def _require_replaceable(folder: Path) -> None:
             return
         with contextlib.suppress(CheckpointError):
             verify(folder)
-            return
+            # A run's own checkpoints hold optimisers and counters too.
+            if [entry.name.split("-", 1)[-1] for entry in (folder / "components").iterdir()] == ["networks"]:
+                return
     msg = f"destination is {folder}; accepted: a folder that is new, empty, or holds released weights and nothing else"
     raise CheckpointError(msg)
 

@@ -20,6 +20,7 @@ from cura_torchrl.trainers.pictures.render_config import RenderConfig
 from cura_torchrl.trainers.pictures.scene_view import scene_frames
 from cura_torchrl.trainers.pictures.video import encode_animation, require_format
 from cura_torchrl.trainers.threads import one_thread
+from cura_torchrl.trainers.training.run_folder import make_folder
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,10 +54,10 @@ def render(config: RenderConfig) -> list[Path]:
     for kind in config.animation_formats:
         require_format(kind)
     loaded = [load_policy(name).double() for name in config.methods]
+    make_folder(config.out, "out")
     recordings = play_scene(config, loaded)
     for recording in recordings:
         logger.info("scene %d, %s: %s", config.scene, recording.label, recording.describe())
-    config.out.mkdir(parents=True, exist_ok=True)
     task = evaluation_task(loaded[0].config.env.task, config)
     return [*_write_figures(config, recordings, task), *_write_animations(config, recordings)]
 

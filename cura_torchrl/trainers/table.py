@@ -59,8 +59,8 @@ def table(config: TableConfig) -> str:
     """  # noqa: DOC502 - raised by what this calls
     policies = _policies(config)
     if config.compare_with is not None:
-        OutcomeStore(config.compare_with, chunk=None).close()  # raises before anything is played
-    with closing(OutcomeStore(config.out / STORE_NAME, chunk=config.side_by_side)) as store:
+        OutcomeStore(config.compare_with, read_only=True).close()  # raises before anything is played
+    with closing(OutcomeStore(config.out / STORE_NAME)) as store:
         for policy in policies:
             store.register(policy.record)
         _play(config, store, policies)
@@ -183,7 +183,7 @@ def _played(config: TableConfig, store: OutcomeStore, policies: list[PolicyRecor
 def _agreement(config: TableConfig, store: OutcomeStore, policies: list[PolicyRecord], path: Path) -> str:
     """Return the section that compares with another file of outcomes."""
     found: dict[tuple[str, str], Agreement] = {}
-    with closing(OutcomeStore(path, chunk=None)) as other:
+    with closing(OutcomeStore(path, read_only=True)) as other:
         for simulator in CHUNKS:
             pairs: dict[str, list[tuple[Episode, Episode]]] = {}
             for policy, cell in itertools.product(policies, config.cells):
@@ -200,7 +200,7 @@ def _agreement(config: TableConfig, store: OutcomeStore, policies: list[PolicyRe
             for entry in policies
             if there.get((entry.method, entry.training_seed), entry.weights_sha256) != entry.weights_sha256
         ]
-        return agreement_section(found, f"{path.as_posix()} (chunk {other.chunk}, here {store.chunk})", changed)
+        return agreement_section(found, path.as_posix(), changed)
 
 
 def _description(config: TableConfig) -> str:

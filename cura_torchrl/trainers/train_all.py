@@ -230,6 +230,9 @@ class _Schedule:
 def _require_same(run: PlannedRun, starts: Mapping[Path, str]) -> None:
     # What is there of a run was begun with the configuration and the warm start that are asked for.
     folder = run.config.run_dir
+    if folder.exists() and not folder.is_dir():
+        msg = f"{folder} is a file; accepted: a run's folder, or a path where one can be made"
+        raise CheckpointError(msg)
     source = _checkpoint_of(folder)
     if source is None:
         return

@@ -56,10 +56,18 @@ class WorkerPool:
         """
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """End the processes; parts that have not been begun are left."""
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """End the processes; after an exception at once, for nobody waits for what they are at.
+
+        Args:
+            kind: The exception's class, if there was one.
+        """
+        if self._pool is None:
+            return
+        if kind is not None:
+            for process in list(self._pool._processes.values()):
+                process.terminate()
+        self._pool.shutdown(cancel_futures=True)
 
     def run(
         self,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -111,6 +112,22 @@ def test_help_lists_every_field(command: str, config: type[object]) -> None:
     words = done.stdout.replace("│", " ").replace(",", " ").split()
     positional = {"--target", "--runs"}
     assert [flag for flag in flags(config) if flag not in words and flag not in positional] == []
+
+
+@pytest.mark.parametrize(
+    ("shell", "message"),
+    [
+        ("--help > /dev/full", "No space left on device"),
+        ("--help >&-", "standard output is closed; accepted: one that can be written"),
+    ],
+)
+def test_what_cannot_be_written_is_told_in_one_line(shell: str, message: str) -> None:
+    """Catches a traceback, at once or when Python ends."""
+    line = f"{shlex.join(COMMAND)} {shell}"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, timeout=280, check=False)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1
 
 
 def test_help_of_a_method_shows_its_own_defaults() -> None:

@@ -115,7 +115,9 @@ def _curves_figure(
     # A method may have points in some panels only, or in none.
     drawn = {label: line for axis in axes for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     if drawn:
-        axes[0].legend(drawn.values(), drawn.keys(), fontsize=8, loc="upper left")
+        figure.legend(
+            drawn.values(), drawn.keys(), fontsize=8, loc="outside upper center", ncols=len(drawn), frameon=False
+        )
     return encode(figure, "png")
 
 

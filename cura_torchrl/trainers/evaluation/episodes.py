@@ -60,8 +60,7 @@ def play_episodes(
 ) -> list[Episode]:
     """Play scenarios, each once, with the policy's mean action unless said otherwise.
 
-    A world whose episode is over takes the next scenario that waits; where none does it stands still, so that the
-    policy's batch keeps its size, on which the last bits of its actions depend.
+    A world whose episode is over takes the next scenario that waits; where none does it stands still.
 
     Args:
         env: N worlds.

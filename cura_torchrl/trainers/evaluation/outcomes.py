@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.evaluation.episodes import Episode, outcome_letter
 from cura_torchrl.trainers.evaluation.measures import Measures
+from cura_torchrl.trainers.training.run_folder import make_folder
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -23,17 +24,16 @@ SHIPPED = -1
 
 _APPLICATION = 0x43555241  # "CURA": tells our file from another program's
 _SCHEMA = f"""
-BEGIN;
-CREATE TABLE settings (chunk INTEGER NOT NULL);
-CREATE TABLE policies (
+BEGIN IMMEDIATE;
+CREATE TABLE IF NOT EXISTS policies (
     method TEXT NOT NULL, training_seed INTEGER NOT NULL,
     weights_sha256 TEXT NOT NULL, frames INTEGER NOT NULL, "commit" TEXT NOT NULL,
     PRIMARY KEY (method, training_seed)
 ) WITHOUT ROWID;
-CREATE TABLE code (
+CREATE TABLE IF NOT EXISTS code (
     id INTEGER PRIMARY KEY, "commit" TEXT NOT NULL, versions TEXT NOT NULL, UNIQUE ("commit", versions)
 );
-CREATE TABLE outcomes (
+CREATE TABLE IF NOT EXISTS outcomes (
     method TEXT NOT NULL, training_seed INTEGER NOT NULL, simulator TEXT NOT NULL, scenario TEXT NOT NULL,
     object_size REAL NOT NULL, max_obstacles INTEGER NOT NULL, scene_seed INTEGER NOT NULL,
     scene_index INTEGER NOT NULL,
@@ -119,35 +119,31 @@ class OutcomeStore:
 
     Args:
         path: The file; it is made, with its folder, where there is none.
-        chunk: Episodes that are played side by side [1]. The last bits depend on it; a file that was filled with
-            another number is refused.
+        read_only: Whether it has to be there, and stays as it is.
 
     Raises:
-        RunError: If the file is damaged, is no file of outcomes, is of another version or of another ``chunk``.
+        RunError: If the file is damaged, is no file of outcomes, is of another version.
 
     Examples:
         >>> import tempfile
         >>> from pathlib import Path
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with contextlib.closing(OutcomeStore(Path(folder) / "outcomes.sqlite", chunk=20)) as store:
+        ...     with contextlib.closing(OutcomeStore(Path(folder) / "outcomes.sqlite")) as store:
         ...         store.policies()
         []
     """
 
-    def __init__(self, path: Path, *, chunk: int | None) -> None:
-        self._path = path
+    def __init__(self, path: Path, *, read_only: bool = False) -> None:
+        self._path, self._read_only = path, read_only
+        if not read_only:
+            make_folder(path.parent, "folder of the outcomes")
         with self._one_line_errors():
-            if chunk is None:
-                # Else SQLite would make a file where there is none.
-                self._database = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
-            else:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                self._database = sqlite3.connect(path, timeout=60.0)
+            # Else SQLite would make a file where there is none.
+            where = f"{path.absolute().as_uri()}?mode=ro" if read_only else path
+            self._database = sqlite3.connect(where, uri=read_only, timeout=60.0)
         try:
             with self._one_line_errors():
-                self._check(is_new=chunk is not None)
-                self.chunk = self._chunk(chunk)
-                """Episodes that were played side by side [1]."""
+                self._check()
         except BaseException:
             self._database.close()
             raise
@@ -246,42 +242,30 @@ class OutcomeStore:
         with self._one_line_errors():
             return self._database.execute(query, values).fetchall()
 
-    def _check(self, *, is_new: bool) -> None:
+    def _check(self) -> None:
         # Makes the tables in a new file, and refuses one that does not fit.
         (answer,) = self._database.execute("PRAGMA integrity_check").fetchone()
         if answer != "ok":
             raise sqlite3.DatabaseError(answer)
         (tables,) = self._database.execute("SELECT count(*) FROM sqlite_master").fetchone()
-        if tables == 0 and is_new:
+        if tables == 0 and not self._read_only:
             self._database.executescript(_SCHEMA)
         found = tuple(
             self._database.execute(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version")
         )
         if found != (_APPLICATION, SCHEMA_VERSION):
             kind = f"is of version {found[1]}" if found[0] == _APPLICATION else "is no file of outcomes"
-            msg = f"{self._path} {kind}; accepted: version {SCHEMA_VERSION}, or another folder with --out"
+            otherwise = "" if self._read_only else ", or another folder with --out"
+            msg = f"{self._path} {kind}; accepted: a file of outcomes of version {SCHEMA_VERSION}{otherwise}"
             raise RunError(msg)
-
-    def _chunk(self, chunk: int | None) -> int:
-        # Notes it in a new file, refuses another one, and tells which it is.
-        if chunk is not None:
-            with self._database:
-                once = "INSERT INTO settings SELECT ? WHERE NOT EXISTS (SELECT * FROM settings)"
-                self._database.execute(once, (chunk,))
-        (known,) = self._database.execute("SELECT chunk FROM settings").fetchone()
-        if chunk not in {known, None}:
-            msg = (
-                f"chunk is {chunk}; accepted: {known}, with which {self._path} was filled, or another folder with --out"
-            )
-            raise RunError(msg)
-        return int(known)
 
     @contextlib.contextmanager
     def _one_line_errors(self) -> Iterator[None]:
         try:
             yield
         except sqlite3.OperationalError as error:
-            msg = f"{self._path} cannot be used: {error}; accepted: a file of outcomes that this user can write"
+            use = "read" if self._read_only else "write"
+            msg = f"{self._path} cannot be used: {error}; accepted: a file of outcomes that this user can {use}"
             raise RunError(msg) from None
         except sqlite3.DatabaseError as error:
             msg = f"{self._path} is damaged: {' '.join(str(error).split())}; accepted: a file as it was written"

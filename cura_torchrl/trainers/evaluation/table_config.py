@@ -89,8 +89,8 @@ class TableConfig:
     num_workers: int = 2
     """Processes that play [1]; results do not depend on it."""
     chunk: int | None = None
-    """Episodes that a process plays side by side [1], 20 on PyBullet and 250 on planar if not given. The last bits
-    depend on it, so that the outcomes of one folder all have the same."""
+    """Episodes that a process plays side by side [1], 20 on PyBullet and 250 on planar if not given; results do not
+    depend on it."""
     compare_with: Path | None = None
     """File of outcomes, of this or the other simulator: tells how many of the same scenes ended alike."""
 

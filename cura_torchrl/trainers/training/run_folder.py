@@ -7,7 +7,7 @@ import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from cura_torchrl.trainers.errors import CheckpointError
+from cura_torchrl.trainers.errors import CheckpointError, RunError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -17,6 +17,24 @@ CHECKPOINT_FOLDER = "checkpoints"
 """Folder of a run that holds its checkpoints."""
 _LOCK_NAME = ".lock"
 _TRIES = 5
+
+
+def make_folder(folder: Path, what: str) -> None:
+    """Make a folder where there is none.
+
+    Args:
+        folder: The folder.
+        what: What it is for, in words.
+
+    Raises:
+        RunError: If it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        accepted = "a folder, or a path where one can be made"
+        msg = f"{what} is {str(folder)!r} ({error.strerror}); accepted: {accepted}"
+        raise RunError(msg) from None
 
 
 @contextmanager
@@ -31,14 +49,15 @@ def locked(folder: Path) -> Iterator[None]:
 
     Raises:
         CheckpointError: If another process trains there.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
+        RunError: If the folder cannot be made.
+    """  # noqa: DOC502 - raised by what this calls
+    make_folder(folder, "run_dir")
     with (folder / _LOCK_NAME).open("w") as file:
         for tries_left in reversed(range(_TRIES)):
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
-            except OSError:
+            except BlockingIOError:
                 if tries_left == 0:
                     msg = f"{folder} is being trained in by another process; accepted: another --run-dir"
                     raise CheckpointError(msg) from None
@@ -74,8 +93,8 @@ def is_locked(folder: Path) -> bool:
     try:
         with (folder / _LOCK_NAME).open() as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return False
-    except OSError:
+    except BlockingIOError:
         return True
     return False

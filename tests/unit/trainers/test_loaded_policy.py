@@ -100,6 +100,17 @@ def test_a_release_with_another_encoder_is_refused(tmp_path: Path, name: str, me
     assert not (tmp_path / "push").exists()
 
 
+def test_a_checkpoint_with_optimisers_is_not_replaced_wherever_it_lies(tmp_path: Path) -> None:
+    """Catches a backup of a run's checkpoint that passes for released weights, and loses all but its networks."""
+    run, kept = _tiny_release(tmp_path), tmp_path / "backup"
+    config = method("push").replace(perception="none")
+    save_checkpoint({"networks": Networks(config), "counters": nn.Linear(1, 1)}, config, tmp_path / "other", frames=1)
+    (tmp_path / "other" / "checkpoint-000000000001").rename(kept)
+    with pytest.raises(CheckpointError, match=r"destination is .*backup; accepted: a folder that is new, empty, or"):
+        release(run, kept)
+    assert len(list((kept / "components").iterdir())) == 2
+
+
 def test_a_release_with_a_copy_of_the_shipped_encoder_forgets_its_path(tmp_path: Path) -> None:
     """Catches a comparison of paths: shipped weights were trained with the file before it came to the package."""
     copy = shutil.copyfile(SHIPPED_ENCODER, tmp_path / "map_vae.pt")

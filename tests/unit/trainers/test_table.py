@@ -179,7 +179,7 @@ def test_another_file_of_outcomes_is_compared_scene_by_scene(tmp_path: Path) -> 
     table(tiny(tmp_path, "first", **options))
     other = tmp_path / "first" / STORE_NAME
     page = table(tiny(tmp_path, "second", compare_with=other, **options))
-    assert f"## Agreement with {other.as_posix()} (chunk 1, here 1)" in page
+    assert f"## Agreement with {other.as_posix()}" in page
     assert "| all | planar | 3 | 100.0 % |" in page
     assert "No scene is in both" in table(tiny(tmp_path, "third", compare_with=other, seed=1, **options))
     (tmp_path / "text").write_text("no database " * 400)

@@ -153,6 +153,17 @@ def test_another_configuration_is_refused_before_anything_starts(tmp_path: Path)
     assert train_all(settings(), moved, command=fake)[0].state == "done"
 
 
+def test_a_file_in_place_of_a_run_is_refused_and_is_no_run(tmp_path: Path) -> None:
+    """Catches a file that passes for a run of another process, which is then waited for without end."""
+    (tmp_path / "push-0").touch()
+    (run,) = planned(tmp_path, "push")
+    assert run.config.run_dir.name == "push-0"
+    assert not is_locked(run.config.run_dir)
+    assert read_status(run).state == "waiting"
+    with pytest.raises(CheckpointError, match=r"push-0 is a file; accepted: a run's folder"):
+        train_all(settings(), [run], command=Fake(tmp_path))
+
+
 def test_another_warm_start_is_refused(tmp_path: Path) -> None:
     """Catches a method that goes on from another start than the one that it is said to have."""
     fake = Fake(tmp_path)

@@ -41,3 +41,19 @@ def test_what_was_done_before_a_process_died_is_kept() -> None:
     ):
         pool.run(_square, [1, 2, -1], keep=kept.__setitem__, tick=lambda _: None)
     assert kept == {1: 1, 2: 4}
+
+
+def _sleep(seconds: float) -> None:
+    time.sleep(seconds)
+
+
+def test_an_error_does_not_wait_for_work_that_nobody_wants() -> None:
+    """Catches Ctrl-C that ends only after the parts under way, which may take many minutes."""
+    started = time.monotonic()
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), WorkerPool(2) as pool:
+        pool.run(_sleep, [0.0, 250.0], keep=stop, tick=lambda _: None)
+    assert time.monotonic() - started < 200.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sqlite3
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from typing import TYPE_CHECKING
 
@@ -58,7 +59,7 @@ def episode(index: int, *, success: bool = False, collision: bool = False) -> Ep
 def test_what_is_read_is_what_was_written(tmp_path: Path) -> None:
     """Catches columns that are read in another order than written, and a cell that answers for another."""
     played = [episode(2, collision=True), episode(0, success=True), episode(1)]
-    with closing(OutcomeStore(tmp_path / "new" / "outcomes.sqlite", chunk=20)) as store:
+    with closing(OutcomeStore(tmp_path / "new" / "outcomes.sqlite")) as store:
         store.register(POLICY)
         store.add(SCENES, played, CODE)
         for field, other in (
@@ -68,7 +69,7 @@ def test_what_is_read_is_what_was_written(tmp_path: Path) -> None:
             ("scene_seed", 1),
         ):
             assert store.read(dataclasses.replace(SCENES, **{field: other}), 9) == []
-    with closing(OutcomeStore(tmp_path / "new" / "outcomes.sqlite", chunk=20)) as store:
+    with closing(OutcomeStore(tmp_path / "new" / "outcomes.sqlite")) as store:
         assert store.read(SCENES, 9) == sorted(played, key=lambda entry: entry.index)
         assert [entry.index for entry in store.read(SCENES, 2)] == [0, 1]
         assert store.policies() == [POLICY]
@@ -87,7 +88,7 @@ def test_a_part_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
         yield episode(1)
         raise KeyboardInterrupt
 
-    with closing(OutcomeStore(tmp_path / "outcomes.sqlite", chunk=20)) as store:
+    with closing(OutcomeStore(tmp_path / "outcomes.sqlite")) as store:
         with pytest.raises(KeyboardInterrupt):
             store.add(SCENES, broken_off(), CODE)
         assert store.read(SCENES, 9) == []
@@ -95,7 +96,7 @@ def test_a_part_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
 
 def test_other_weights_are_refused(tmp_path: Path) -> None:
     """Catches a table whose rows mix two policies."""
-    with closing(OutcomeStore(tmp_path / "outcomes.sqlite", chunk=20)) as store:
+    with closing(OutcomeStore(tmp_path / "outcomes.sqlite")) as store:
         store.register(POLICY)
         store.register(POLICY)
         store.register(dataclasses.replace(POLICY, training_seed=1, weights_sha256="b" * 64))
@@ -117,34 +118,34 @@ def test_other_weights_are_refused(tmp_path: Path) -> None:
 def test_a_damaged_file_is_refused_in_one_line(damage: object, message: str, tmp_path: Path) -> None:
     """Catches a traceback, and a table that is made from what is left of the outcomes."""
     path = tmp_path / "outcomes.sqlite"
-    with closing(OutcomeStore(path, chunk=20)) as store:
+    with closing(OutcomeStore(path)) as store:
         store.add(SCENES, [episode(index) for index in range(500)], CODE)
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(RunError, match=message) as told:
-        OutcomeStore(path, chunk=20)
+        OutcomeStore(path)
     assert "\n" not in str(told.value)
 
 
-def test_a_file_of_another_version_chunk_or_program_is_refused(tmp_path: Path) -> None:
-    """Catches outcomes that are read with the wrong meaning, or that were played in batches of another size."""
+def test_a_file_of_another_version_or_program_is_refused(tmp_path: Path) -> None:
+    """Catches outcomes that are read with the wrong meaning, and advice about a folder for a file that is only read."""
     path, foreign = tmp_path / "outcomes.sqlite", tmp_path / "foreign.sqlite"
-    OutcomeStore(path, chunk=20).close()
-    with pytest.raises(RunError, match="chunk is 5; accepted: 20"):
-        OutcomeStore(path, chunk=5)
+    OutcomeStore(path).close()
     with closing(sqlite3.connect(path)) as database:
         database.execute("PRAGMA user_version = 99")
-    with pytest.raises(RunError, match="is of version 99; accepted: version 2"):
-        OutcomeStore(path, chunk=20)
+    with pytest.raises(RunError, match=r"is of version 99; accepted: a file .* 2, or another folder"):
+        OutcomeStore(path)
     with closing(sqlite3.connect(foreign)) as database:
         database.execute("CREATE TABLE mail (sender TEXT)")
     with pytest.raises(RunError, match="is no file of outcomes"):
-        OutcomeStore(foreign, chunk=20)
+        OutcomeStore(foreign)
+    with pytest.raises(RunError, match=r"is no file of outcomes; accepted: a file of outcomes of version 2$"):
+        OutcomeStore(foreign, read_only=True)
 
 
 def test_rows_tell_by_which_code_they_were_played(tmp_path: Path) -> None:
     """Catches rows that pass for those of the last commit, and code that is listed though none of its rows is left."""
     later = CodeRecord(commit="cafe", versions={"torch": "2.14.0"})
-    with closing(OutcomeStore(tmp_path / "outcomes.sqlite", chunk=20)) as store:
+    with closing(OutcomeStore(tmp_path / "outcomes.sqlite")) as store:
         store.add(SCENES, [episode(0), episode(1)], CODE)
         store.add(SCENES, [episode(1), episode(2)], later)
         assert store.code() == [CODE, later]
@@ -153,16 +154,29 @@ def test_rows_tell_by_which_code_they_were_played(tmp_path: Path) -> None:
         assert store.code() == [later]
 
 
-def test_a_file_can_be_read_whatever_it_was_filled_with_but_is_not_made(tmp_path: Path) -> None:
+def test_a_file_can_be_read_but_is_not_made(tmp_path: Path) -> None:
     """Catches a comparison that changes the other file, or that makes an empty one where a name is misspelt."""
     path = tmp_path / "outcomes.sqlite"
-    with closing(OutcomeStore(path, chunk=7)) as store:
+    with closing(OutcomeStore(path)) as store:
         store.add(SCENES, [episode(0)], CODE)
-    with closing(OutcomeStore(path, chunk=None)) as store:
-        assert store.chunk == 7
+    with closing(OutcomeStore(path, read_only=True)) as store:
         assert store.read(SCENES, 9) == [episode(0)]
         with pytest.raises(RunError, match="cannot be used: attempt to write a readonly database"):
             store.add(SCENES, [episode(1)], CODE)
-    with pytest.raises(RunError, match="cannot be used: unable to open database file"):
-        OutcomeStore(tmp_path / "other.sqlite", chunk=None)
+    with pytest.raises(RunError, match=r"unable to open .*; accepted: .* that this user can read"):
+        OutcomeStore(tmp_path / "other.sqlite", read_only=True)
     assert not (tmp_path / "other.sqlite").exists()
+
+
+def test_two_can_make_the_same_file(tmp_path: Path) -> None:
+    """Catches the second of two processes that begin at once, which finds the tables made meanwhile."""
+    with ThreadPoolExecutor(8) as pool:
+        for store in pool.map(lambda _: OutcomeStore(tmp_path / "new" / "outcomes.sqlite").close(), range(16)):
+            assert store is None
+
+
+def test_a_folder_that_cannot_be_made_is_told_in_one_line(tmp_path: Path) -> None:
+    """Catches an error number in place of what is accepted."""
+    (tmp_path / "file").touch()
+    with pytest.raises(RunError, match=r"folder of the outcomes is '.*file' \(File exists\); accepted: a folder"):
+        OutcomeStore(tmp_path / "file" / "outcomes.sqlite")
