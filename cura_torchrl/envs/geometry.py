@@ -79,8 +79,8 @@ def inverse(matrix: torch.Tensor) -> torch.Tensor:
         Goodnight (1979), "A Tutorial on the SWEEP Operator"; it needs no pivoting here.
 
     Examples:
-        >>> inverse(torch.tensor([[2.0, 0.0], [0.0, 4.0]])).tolist()
-        [[0.5, 0.0], [0.0, 0.25]]
+        >>> inverse(torch.tensor([[2.0, 1.0], [1.0, 1.0]])).tolist()
+        [[1.0, -1.0], [-1.0, 2.0]]
     """
     result = matrix
     for k in range(matrix.shape[-1]):

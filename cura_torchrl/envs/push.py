@@ -301,7 +301,7 @@ class PushEnv(EnvBase):
             steps_since_success=self._since_success,
         )
         self._previous_action, self._is_over = action.float(), terminated | truncated
-        ends = {"terminated": terminated, "truncated": truncated, "done": self._is_over}
+        ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
         columns = {name: flag[:, None] for name, flag in ends.items()}
         return self._emit().update({keys.REWARD: reward, keys.COST: cost, **columns})
 

@@ -15,7 +15,6 @@ from cura_torchrl.trainers.errors import WorkerError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from typing_extensions import Self
 
 _Part = TypeVar("_Part")
 _Result = TypeVar("_Result")
@@ -48,7 +47,7 @@ class WorkerPool:
                 num_workers, mp_context=context, initializer=_begin, initargs=(self._counter,)
             )
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> WorkerPool:
         """Open the pool.
 
         Returns:

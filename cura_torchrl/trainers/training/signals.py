@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from cura_torchrl.trainers.errors import Interrupted
 
@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from types import FrameType
 
-    from typing_extensions import Self
+
+_Requests = TypeVar("_Requests", bound="StopRequests")
 
 
 class StopRequests:
@@ -31,7 +32,7 @@ class StopRequests:
         self._numbers = numbers
         self._before: dict[int, Any] = {}
 
-    def __enter__(self) -> Self:
+    def __enter__(self: _Requests) -> _Requests:
         """Note signals from now on.
 
         Returns:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import math
-import pickle
 from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
 
 from cura_torchrl.envs.config import LidarConfig, PushEnvConfig, RobotConfig, ScenarioConfig, TaskConfig
 from cura_torchrl.envs.mdp.observations import OBSERVATION_SLICES
 from cura_torchrl.envs.push import PushEnv
-from cura_torchrl.envs.robots.scripted import ScriptedPusher
 from tests.contracts.env import LIMIT, EnvContract, assert_same, draw_actions, play
 from tests.worlds import place
 
@@ -83,26 +79,6 @@ def make() -> Iterator[Any]:
     yield build
     for env in envs:
         env.close()
-
-
-@pytest.mark.parametrize("model", ["ridgeback_franka", "ridgeback"])
-@pytest.mark.parametrize("simulator", ["planar", "bullet"])
-def test_what_is_pushed_moves_bitwise_as_it_does_alone(make: Any, simulator: Any, model: Any) -> None:
-    """Catches products that round by the size of the batch: contact makes ten times as much of it in every step."""
-    robot = RobotConfig(model=model)
-    config = dataclasses.replace(make_config(50), simulator=simulator, robot=robot)
-    # What is emitted is rounded to float32; the simulators' own state is not. 33 is no multiple of a vector's width.
-    together, alone, pusher = make(33, config), make(1, config), ScriptedPusher(robot)
-    row, steps = 31, 20
-    data = together.reset()
-    single = alone.reset(episodes=data["episode"][row])
-    for _ in range(steps):
-        action = pusher(data)["action"]
-        data = together.step(data)["next"]
-        single = alone.step(single.set("action", action[row : row + 1]))["next"]
-        for name, value in vars(alone.world_state).items():
-            assert torch.equal(value[0], getattr(together.world_state, name)[row]), name
-    assert together.world_state.object_velocity[row].norm() > 0.1
 
 
 def steady(env: PushEnv, steps: int, *action: float) -> torch.Tensor:
@@ -377,31 +353,3 @@ def test_misuse_is_told_in_one_line(make):
         PushEnv(0)
     with pytest.raises(RuntimeError, match=r"^the environment has not been reset; accepted: reset\(\) before"):
         _ = make(1).world_state
-
-
-def test_a_row_that_is_stepped_after_its_end_stands_still(make: Any) -> None:
-    """Catches a robot that drives through obstacles after a collision, until its LiDAR is inside of one."""
-    env = make(16, dataclasses.replace(make_config(120), simulator="planar"))
-    ahead = torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]).expand(16, 6)
-    policy = TensorDictModule(lambda _: ahead, in_keys=["observation"], out_keys=["action"])
-    rollout = env.rollout(120, policy, break_when_any_done=False, break_when_all_done=True)
-    collided = rollout["next", "terminated"][:, :-5].any(1).flatten()
-    assert collided.any()
-    speed = env.world_state.base_velocity[collided].norm(dim=-1)
-    assert (speed < 1e-3).all()
-
-
-def test_worlds_of_pybullet_are_not_copied(make: Any) -> None:
-    """Catches a copy that shares its worlds with the original, and whose controller moves nothing."""
-    env = make(1, make_config())
-    for copied in (copy.deepcopy, pickle.dumps):
-        with pytest.raises(TypeError, match=r"cannot be copied, .*; accepted: to make them there"):
-            copied(env)
-
-
-def test_a_list_of_episodes_is_as_good_as_a_tensor(make: Any) -> None:
-    """Catches an error about an attribute of lists."""
-    env = make(2, dataclasses.replace(make_config(), simulator="planar"))
-    assert env.reset(episodes=[7, 3])["episode"].flatten().tolist() == [7, 3]
-    with pytest.raises(ValueError, match=r"episodes are \[7\]; accepted: 2 integers"):
-        env.reset(episodes=[7])

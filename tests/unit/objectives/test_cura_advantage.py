@@ -10,39 +10,15 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives.value import GAE
 
-from cura_torchrl.modules import DistributionalCollisionEstimator, make_critic, make_risk_measure
+from cura_torchrl.modules import DistributionalCollisionEstimator, make_risk_measure
 from cura_torchrl.objectives import CURAAdvantage
-
-ENVS, STEPS = 6, 16
-
-
-def _networks() -> tuple[TensorDictModule, DistributionalCollisionEstimator]:
-    torch.manual_seed(1)
-    return make_critic(5, hidden_sizes=(16,)), DistributionalCollisionEstimator(5, num_atoms=10, hidden_sizes=(16,))
-
-
-def _rollout(seed: int = 0) -> TensorDict:
-    torch.manual_seed(seed)
-
-    def seen() -> dict[str, torch.Tensor]:
-        return {"observation": torch.randn(ENVS, STEPS, 3), "latent": torch.randn(ENVS, STEPS, 2)}
-
-    terminated = torch.rand(ENVS, STEPS, 1) < 0.1
-    done = terminated | (torch.rand(ENVS, STEPS, 1) < 0.1)
-    signals = {"reward": torch.randn(ENVS, STEPS, 1), "cost": terminated.float()}
-    return TensorDict({**seen(), "next": {**seen(), **signals, "done": done, "terminated": terminated}}, [ENVS, STEPS])
-
-
-class _Table(nn.Module):
-    """An estimator whose risk and uncertainty are read off the observation: two atoms at r +- sqrt(u)."""
-
-    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        risk, uncertainty = observation[..., :1], observation[..., 1:]
-        return torch.cat([risk - uncertainty.sqrt(), risk + uncertainty.sqrt()], -1), risk, uncertainty
+from tests.rollouts import ENVS, STEPS, StateEstimator, make_networks, make_rollout
 
 
 def _table() -> TensorDictModule:
-    return TensorDictModule(_Table(), in_keys=["observation"], out_keys=["collision_atoms", "risk", "uncertainty"])
+    return TensorDictModule(
+        StateEstimator(), in_keys=["observation"], out_keys=["collision_atoms", "risk", "uncertainty"]
+    )
 
 
 def _zero_critic() -> TensorDictModule:
@@ -63,20 +39,22 @@ def _table_rollout() -> TensorDict:
 @pytest.mark.parametrize("scale", ["raw", "zscore"])
 def test_without_costs_it_is_gae_to_the_last_bit(scale: str) -> None:
     """Catches any difference from plain PPO in the methods without costs: they must be TorchRL's z-scored GAE."""
-    critic, estimator = _networks()
-    ours = CURAAdvantage(critic, estimator, risk_coeff=0.0, uncertainty_coeff=0.0, advantage_scale=scale)(_rollout())
-    theirs = GAE(gamma=0.99, lmbda=0.95, value_network=critic, average_gae=True)(_rollout())
+    critic, estimator = make_networks()
+    ours = CURAAdvantage(critic, estimator, risk_coeff=0.0, uncertainty_coeff=0.0, advantage_scale=scale)(
+        make_rollout()
+    )
+    theirs = GAE(gamma=0.99, lmbda=0.95, value_network=critic, average_gae=True)(make_rollout())
     for key in ("advantage", "value_target", "state_value", ("next", "state_value")):
         assert torch.equal(ours[key], theirs[key]), key
 
 
 def test_without_costs_a_broken_estimator_changes_nothing() -> None:
     """Catches 0 * NaN in the policy's advantage of methods that do not use the costs."""
-    critic, estimator = _networks()
-    clean = CURAAdvantage(critic, estimator, risk_coeff=0.0, uncertainty_coeff=0.0)(_rollout())["advantage"]
+    critic, estimator = make_networks()
+    clean = CURAAdvantage(critic, estimator, risk_coeff=0.0, uncertainty_coeff=0.0)(make_rollout())["advantage"]
     with torch.no_grad():
         next(estimator.parameters()).fill_(float("nan"))
-    broken = CURAAdvantage(critic, estimator, risk_coeff=0.0, uncertainty_coeff=0.0)(_rollout())
+    broken = CURAAdvantage(critic, estimator, risk_coeff=0.0, uncertainty_coeff=0.0)(make_rollout())
     assert torch.equal(broken["advantage"], clean)
 
 
@@ -163,48 +141,21 @@ def test_a_baseline_takes_out_what_the_state_explains() -> None:
     assert by_baseline["mean"] > -0.5
 
 
-def test_a_baseline_does_not_learn_a_small_rollout_by_heart() -> None:
-    """Catches a regression on more numbers than samples: it explains all, and nothing is left of the costs."""
-    critic, estimator = _networks()
-    rollout = _rollout()[:1, :6]  # six samples of seven numbers each
-    small = {
-        name: CURAAdvantage(critic, estimator, cost_baseline=name)(rollout.clone())["advantage"]
-        for name in ("mean", "state")
-    }
-    torch.testing.assert_close(small["state"], small["mean"])
-    whole = {name: CURAAdvantage(critic, estimator, cost_baseline=name)(_rollout())["advantage"] for name in small}
-    assert (whole["state"] - whole["mean"]).abs().max() > 0.1
-
-
-def test_a_baseline_of_the_state_takes_observations_of_any_shape() -> None:
-    """Catches a concatenation that only vectors fit into."""
-
-    class Wide(nn.Module):
-        def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
-            return _Table()(image.flatten(-3)[..., :2].abs() + 0.1)
-
-    wide = TensorDictModule(Wide(), in_keys=["image"], out_keys=["collision_atoms", "risk", "uncertainty"])
-    rollout = _rollout()
-    rollout["image"], rollout["next", "image"] = torch.randn(2, ENVS, STEPS, 2, 2, 2).unbind(0)
-    critic, _ = _networks()
-    assert CURAAdvantage(critic, wide, cost_baseline="state")(rollout)["advantage"].isfinite().all()
-
-
 def test_the_sum_is_standardised_for_the_optimiser() -> None:
     """Catches a sum that keeps the scale of the reward, on which PPO's step size would depend."""
-    critic, estimator = _networks()
-    plain = CURAAdvantage(critic, estimator, normalise_sum=False)(_rollout())["advantage"]
-    advantage = CURAAdvantage(critic, estimator)(_rollout())["advantage"]
+    critic, estimator = make_networks()
+    plain = CURAAdvantage(critic, estimator, normalise_sum=False)(make_rollout())["advantage"]
+    advantage = CURAAdvantage(critic, estimator)(make_rollout())["advantage"]
     assert torch.allclose(advantage, (plain - plain.mean()) / plain.std(), atol=1e-6)
 
 
 def test_the_placebo_deals_the_same_uncertainty_costs_to_other_steps() -> None:
     """Catches a placebo that changes the costs' distribution, reaches terminal steps or leaves the costs in place."""
-    critic, estimator = _networks()
+    critic, estimator = make_networks()
     plain, placebo = (
         CURAAdvantage(
             critic, estimator, risk_coeff=0.0, uncertainty_coeff=1.0, normalise_sum=False, shuffle_uncertainty=shuffled
-        )(_rollout())
+        )(make_rollout())
         for shuffled in (False, True)
     )
     raw = plain["value_target"] - plain["state_value"]
@@ -252,13 +203,13 @@ def test_a_truncated_step_bootstraps_and_keeps_its_costs() -> None:
 
 def test_coefficients_can_be_set_and_are_saved() -> None:
     """Catches a warm-up that has no effect because an attribute shadows the buffer."""
-    critic, estimator = _networks()
+    critic, estimator = make_networks()
     estimate = CURAAdvantage(critic, estimator, risk_coeff=0.0, uncertainty_coeff=0.0)
-    cold = estimate(_rollout())["advantage"]
+    cold = estimate(make_rollout())["advantage"]
     estimate.risk_coeff, estimate.uncertainty_coeff = 0.25, 1
-    warm = estimate(_rollout())["advantage"]
+    warm = estimate(make_rollout())["advantage"]
     assert not torch.allclose(cold, warm)
-    assert torch.equal(warm, CURAAdvantage(critic, estimator)(_rollout())["advantage"])
+    assert torch.equal(warm, CURAAdvantage(critic, estimator)(make_rollout())["advantage"])
     assert estimate.state_dict()["risk_coeff"].item() == 0.25
     estimate.risk_coeff = np.float32(0.5)
     assert estimate.risk_coeff.item() == 0.5
@@ -268,22 +219,22 @@ def test_coefficients_can_be_set_and_are_saved() -> None:
 
 def test_a_resumed_run_draws_the_same_targets() -> None:
     """Catches a generator that starts again after loading: targets of the second rollout must be equal."""
-    first, resumed = CURAAdvantage(*_networks(), seed=3), CURAAdvantage(*_networks(), seed=4)
-    first(_rollout())
+    first, resumed = CURAAdvantage(*make_networks(), seed=3), CURAAdvantage(*make_networks(), seed=4)
+    first(make_rollout())
     resumed.load_state_dict(first.state_dict())
-    assert torch.equal(first(_rollout(1))["collision_target"], resumed(_rollout(1))["collision_target"])
-    fresh = CURAAdvantage(*_networks(), seed=3)(_rollout(1))["collision_target"]
-    assert not torch.equal(fresh, first(_rollout(1))["collision_target"])
+    assert torch.equal(first(make_rollout(1))["collision_target"], resumed(make_rollout(1))["collision_target"])
+    fresh = CURAAdvantage(*make_networks(), seed=3)(make_rollout(1))["collision_target"]
+    assert not torch.equal(fresh, first(make_rollout(1))["collision_target"])
 
 
 def test_padding_counts_for_nothing() -> None:
     """Catches padded steps in the statistics or leaking into targets: results equal those of the unpadded rollout."""
-    estimate = CURAAdvantage(*_networks(), collision_lmbda=1.0)
-    short = _rollout()[:, :10].clone()
+    estimate = CURAAdvantage(*make_networks(), collision_lmbda=1.0)
+    short = make_rollout()[:, :10].clone()
     short["next", "terminated"][:, -1] = True
     short["next", "done"][:, -1] = True
     expected = estimate(short.clone())
-    padded = torch.cat([short, _rollout(1)[:, 10:]], 1)
+    padded = torch.cat([short, make_rollout(1)[:, 10:]], 1)
     padded["next", "reward"][:, 10:] = 1e3
     padded["next", "terminated"][:, 10:] = False
     padded["next", "done"][:, 10:] = False
@@ -296,8 +247,8 @@ def test_padding_counts_for_nothing() -> None:
 
 def test_padding_after_an_open_trajectory_does_not_reach_its_targets() -> None:
     """Catches a trace that runs on from a trajectory's last step, which is not done, into its padding."""
-    estimate = CURAAdvantage(*_networks(), collision_lmbda=1.0)
-    rollout = _rollout()
+    estimate = CURAAdvantage(*make_networks(), collision_lmbda=1.0)
+    rollout = make_rollout()
     for flag in ("done", "terminated"):
         rollout["next", flag] = torch.zeros(ENVS, STEPS, 1, dtype=torch.bool)
     expected = estimate(rollout[:, :10].clone())["collision_target"]
@@ -309,8 +260,8 @@ def test_padding_after_an_open_trajectory_does_not_reach_its_targets() -> None:
 @pytest.mark.parametrize("options", [{}, {"risk_coeff": 0.0, "uncertainty_coeff": 0.0}])
 def test_padding_after_an_open_trajectory_does_not_reach_its_advantage(options: dict[str, float]) -> None:
     """Catches an advantage or value target that runs on from a trajectory's last step, not done, into its padding."""
-    estimate = CURAAdvantage(*_networks(), **options)
-    rollout = _rollout()
+    estimate = CURAAdvantage(*make_networks(), **options)
+    rollout = make_rollout()
     for flag in ("done", "terminated"):
         rollout["next", flag] = torch.zeros(ENVS, STEPS, 1, dtype=torch.bool)
     expected = estimate(rollout[:, :10].clone())
@@ -326,8 +277,8 @@ def test_padding_after_an_open_trajectory_does_not_reach_its_advantage(options: 
 
 def test_a_rollout_without_the_cost_is_refused_before_anything_is_written() -> None:
     """Catches an error that does not name what is missing, and a rollout that is left half done."""
-    estimate = CURAAdvantage(*_networks())
-    rollout = _rollout()
+    estimate = CURAAdvantage(*make_networks())
+    rollout = make_rollout()
     del rollout["next", "cost"]
     before = set(rollout.keys(True, True))
     with pytest.raises(KeyError, match=r"\('next', 'cost'\) is missing; accepted: .* set_keys"):
@@ -337,9 +288,9 @@ def test_a_rollout_without_the_cost_is_refused_before_anything_is_written() -> N
 
 def test_a_network_that_writes_other_keys_is_refused_before_anything_is_written() -> None:
     """Catches an estimator of other out_keys that fails on a missing tensor; set_keys tells them."""
-    critic, _ = _networks()
+    critic, _ = make_networks()
     other = DistributionalCollisionEstimator(5, hidden_sizes=(16,), out_keys=("atoms", "risk", "uncertainty"))
-    estimate, rollout = CURAAdvantage(critic, other), _rollout()
+    estimate, rollout = CURAAdvantage(critic, other), make_rollout()
     before = set(rollout.keys(True, True))
     with pytest.raises(KeyError, match=r"'collision_atoms' is missing; accepted: .* set_keys"):
         estimate(rollout)
@@ -348,45 +299,15 @@ def test_a_network_that_writes_other_keys_is_refused_before_anything_is_written(
     assert estimate(rollout)["collision_target"].shape == (ENVS, STEPS, 50)
 
 
-def test_a_critic_that_writes_another_key_is_refused_before_anything_is_written() -> None:
-    """Catches an error deep inside of TorchRL's estimator; set_keys tells the key."""
-    _, estimator = _networks()
-    estimate, rollout = CURAAdvantage(make_critic(5, hidden_sizes=(16,), out_key="v"), estimator), _rollout()
-    before = set(rollout.keys(True, True))
-    with pytest.raises(KeyError, match=r"'state_value' is missing; accepted: networks"):
-        estimate(rollout)
-    assert set(rollout.keys(True, True)) == before
-    estimate.set_keys(value="v")
-    assert estimate(rollout)["advantage"].isfinite().all()
-
-
-def test_time_that_is_not_the_last_dimension_is_refused() -> None:
-    """Catches a rollout half of which is read along time: GAE looks for the dimension's name."""
-    first = _rollout().transpose(0, 1).contiguous()
-    first.names = ["time", None]
-    with pytest.raises(ValueError, match=r"dimensions are \['time', None\]; accepted: time as the last one"):
-        CURAAdvantage(*_networks())(first)
-    last = _rollout()
-    last.names = [None, "time"]
-    assert CURAAdvantage(*_networks())(last)["advantage"].isfinite().all()
-
-
-def test_both_networks_move_with_it() -> None:
-    """Catches a critic that stays on its device and in its precision, for TorchRL hides it from PyTorch."""
-    estimate = CURAAdvantage(*_networks()).double()
-    rollout = _rollout().apply(lambda value: value.double() if value.is_floating_point() else value)
-    assert estimate(rollout)["advantage"].dtype == torch.float64
-
-
 def test_keys_can_be_nested() -> None:
     """Catches a hard-coded key anywhere between GAE, costs and targets."""
-    critic, estimator = _networks()
-    expected = CURAAdvantage(critic, estimator)(_rollout())
+    critic, estimator = make_networks()
+    expected = CURAAdvantage(critic, estimator)(make_rollout())
     estimate = CURAAdvantage(critic, estimator)
     estimate.set_keys(
         cost=("signal", "c"), reward=("signal", "r"), advantage=("out", "a"), collision_target=("out", "t")
     )
-    moved = _rollout()
+    moved = make_rollout()
     moved["next"].rename_key_("cost", ("signal", "c")).rename_key_("reward", ("signal", "r"))
     out = estimate(moved)
     assert torch.equal(out["out", "a"], expected["advantage"])
@@ -399,8 +320,8 @@ def test_keys_can_be_nested() -> None:
 
 def test_in_and_out_keys_are_exact() -> None:
     """Catches keys that are read or written without being listed."""
-    estimate = CURAAdvantage(*_networks())
-    rollout = _rollout()
+    estimate = CURAAdvantage(*make_networks())
+    rollout = make_rollout()
     before = set(rollout.keys(True, True))
     assert set(estimate.in_keys) == before
     estimate(rollout)
@@ -410,9 +331,9 @@ def test_in_and_out_keys_are_exact() -> None:
 
 def test_keyword_tensors_give_the_same_as_a_tensordict() -> None:
     """Catches a forward that is not dispatched."""
-    rollout = _rollout()
-    out = CURAAdvantage(*_networks())(rollout.clone())
-    estimate = CURAAdvantage(*_networks())
+    rollout = make_rollout()
+    out = CURAAdvantage(*make_networks())(rollout.clone())
+    estimate = CURAAdvantage(*make_networks())
     flat = {"_".join(key) if isinstance(key, tuple) else key: rollout[key] for key in estimate.in_keys}
     for value, key in zip(estimate(**flat), estimate.out_keys, strict=True):
         assert torch.equal(value, out[key]), key
@@ -420,7 +341,7 @@ def test_keyword_tensors_give_the_same_as_a_tensordict() -> None:
 
 def test_nothing_of_it_carries_a_gradient() -> None:
     """Catches a graph of the whole rollout that is kept alive until the next one."""
-    rollout = CURAAdvantage(*_networks())(_rollout())
+    rollout = CURAAdvantage(*make_networks())(make_rollout())
     assert not any(value.requires_grad for value in rollout.values(True, True))
 
 
@@ -459,4 +380,4 @@ def test_diagnostics_are_the_numbers_they_say() -> None:
 def test_nonsense_is_refused(kwargs: dict[str, object], message: str) -> None:
     """Catches a misspelt option that silently means the other one, and a division by zero."""
     with pytest.raises(ValueError, match=message):
-        CURAAdvantage(*_networks(), **kwargs)
+        CURAAdvantage(*make_networks(), **kwargs)

@@ -146,7 +146,7 @@ def test_shipped_weights_are_evaluated_on_what_they_were_trained_on(name: str) -
 def test_all_are_evaluated_on_the_same_task_whatever_they_were_trained_on(tmp_path: Path) -> None:
     """Catches a light object, a wide goal or a soft floor that a policy takes with it from its training."""
     task = TaskConfig(
-        scenario=ScenarioConfig(object_mass=(1.0, 1.0), floor_friction=(0.1, 0.1), obstacle_edges=(0.2,)),
+        scenario=ScenarioConfig(object_mass=(1.0, 1.0), floor_friction=(0.1, 0.1), obstacle_edges=(0.3,)),
         tolerances=(2.0, 1.0, 0.5),
         episode_time=200.0,
     )
