@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from cura_torchrl.trainers.evaluation.task import evaluation_task
+from cura_torchrl.trainers.folders import make_folder
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.methods import policy_labels
 from cura_torchrl.trainers.pictures.animation import animation_frames, frame_numbers
@@ -20,7 +21,6 @@ from cura_torchrl.trainers.pictures.render_config import RenderConfig
 from cura_torchrl.trainers.pictures.scene_view import scene_frames
 from cura_torchrl.trainers.pictures.video import encode_animation, require_format
 from cura_torchrl.trainers.threads import one_thread
-from cura_torchrl.trainers.training.run_folder import make_folder
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.evaluation.episodes import Episode, outcome_letter
 from cura_torchrl.trainers.evaluation.measures import Measures
-from cura_torchrl.trainers.training.run_folder import make_folder
+from cura_torchrl.trainers.folders import make_folder
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -7,7 +7,8 @@ import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from cura_torchrl.trainers.errors import CheckpointError, RunError
+from cura_torchrl.trainers.errors import CheckpointError
+from cura_torchrl.trainers.folders import make_folder
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -17,24 +18,6 @@ CHECKPOINT_FOLDER = "checkpoints"
 """Folder of a run that holds its checkpoints."""
 _LOCK_NAME = ".lock"
 _TRIES = 5
-
-
-def make_folder(folder: Path, what: str) -> None:
-    """Make a folder where there is none.
-
-    Args:
-        folder: The folder.
-        what: What it is for, in words.
-
-    Raises:
-        RunError: If it cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        accepted = "a folder, or a path where one can be made"
-        msg = f"{what} is {str(folder)!r} ({error.strerror}); accepted: {accepted}"
-        raise RunError(msg) from None
 
 
 @contextmanager
