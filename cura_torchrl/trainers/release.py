@@ -70,7 +70,7 @@ def _require_replaceable(folder: Path) -> None:
         with contextlib.suppress(CheckpointError):
             verify(folder)
             # A run's own checkpoints hold optimisers and counters too.
-            if [entry.name.split("-", 1)[-1] for entry in (folder / "components").iterdir()] == ["networks"]:
+            if [entry.name.split("-", 1)[-1] for entry in (folder / "components").glob("*")] == ["networks"]:
                 return
     msg = f"destination is {folder}; accepted: a folder that is new, empty, or holds released weights and nothing else"
     raise CheckpointError(msg)
