@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from cura_torchrl.trainers.benches import env, ik, learner, lidar, peers
+from cura_torchrl.trainers.folders import make_place
 from cura_torchrl.trainers.info import provenance
 from cura_torchrl.trainers.threads import one_thread
 
@@ -46,7 +47,7 @@ def bench(config: BenchConfig) -> dict[str, Any]:
         What the file holds, JSON-compatible.
     """
     path = config.output or OUTPUT_FOLDER / f"{config.target}.json"
-    path.parent.mkdir(parents=True, exist_ok=True)  # before minutes of measuring
+    make_place(path, "output")  # before minutes of measuring
     load = os.getloadavg()[0]
     with one_thread():
         torch.manual_seed(config.seed)

@@ -23,6 +23,7 @@ from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.evaluation.active_perception import LookingMeter
 from cura_torchrl.trainers.evaluation.episodes import play_episodes
 from cura_torchrl.trainers.evaluation.statistics import bootstrap_interval
+from cura_torchrl.trainers.folders import make_folder
 from cura_torchrl.trainers.info import provenance
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.threads import one_thread
@@ -61,7 +62,7 @@ def calibrate(config: CalibrateConfig) -> str:
         msg = f"method is {blind[0]}, which sees no map; accepted: a policy that sees one"
         raise RunError(msg)
     origin = provenance()  # of the code that runs, whatever is changed meanwhile
-    config.out.mkdir(parents=True, exist_ok=True)
+    make_folder(config.out, "out")
     states = config.states if config.simulator == "planar" else 0
     total = len(policies) * (config.episodes * len(config.conditions) + states)
     page = ""

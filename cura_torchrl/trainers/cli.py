@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import signal
 import sys
 from typing import TYPE_CHECKING
 
@@ -24,7 +25,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Arguments; those of the process if None.
 
     Returns:
-        Exit code: 0, 2 after a one-line error, 1 if some of several runs failed, 130 and 143 after SIGINT and SIGTERM.
+        Exit code: 0, 2 after a one-line error, 1 if some of several runs failed, 130 and 143 after SIGINT and SIGTERM,
+        141 when nobody reads on.
     """
     # PyTorch then takes huge pages for large tensors. It reads this once, when it makes the first one.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
@@ -34,9 +36,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _run(given)
     except RunError as error:
         return _complain(error, error.exit_code)
+    except BrokenPipeError:  # who reads has seen enough, such as ``| head``
+        _discard_output()
+        return 128 + signal.SIGPIPE
     except OSError as error:
-        with contextlib.suppress(OSError):  # what could not be written would be told again at the end
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
         return _complain(error, RunError.exit_code)
     except KeyboardInterrupt:
         return 130
@@ -53,6 +57,12 @@ def _run(given: list[str]) -> None:
     else:
         raise RunError(f"{given[0]!r} is no command; accepted: {', '.join(COMMANDS)}")
     sys.stdout.flush()  # else it would be told after the end that nothing could be written
+
+
+def _discard_output() -> None:
+    """Let what could not be written not be told again when Python ends."""
+    with contextlib.suppress(OSError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _complain(error: Exception, code: int) -> int:

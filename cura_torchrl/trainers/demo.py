@@ -21,6 +21,7 @@ from cura_torchrl.trainers.checkpoint import progress_path
 from cura_torchrl.trainers.errors import RunError, UnavailableError
 from cura_torchrl.trainers.evaluation.episodes import summarise
 from cura_torchrl.trainers.evaluation.task import evaluation_physics, frozen_task
+from cura_torchrl.trainers.folders import make_folder
 from cura_torchrl.trainers.info import git_commit, hardware, shipped_methods, versions
 from cura_torchrl.trainers.loaded_policy import load_policy
 from cura_torchrl.trainers.methods import PRESETS, policy_labels
@@ -73,7 +74,9 @@ def demo(config: DemoConfig) -> Path:
     loaded = [_load(name, config) for name in config.policies]
     tasks = [_task(config, policy) for policy in loaded]
     scenes = _scenes(config, tasks[0])
-    config.run_dir.mkdir(parents=True, exist_ok=True)
+    make_folder(config.run_dir, "run_dir")
+    if config.docs_dir is not None:
+        make_folder(config.docs_dir, "docs_dir")
     with WorkerPool(config.num_workers) as pool:
         pairs = _play(config, loaded, tasks, scenes, pool)
         telling = most_telling(pairs, config.telling_scenes)
@@ -122,11 +125,10 @@ def write_pictures(folder: Path, card: Card, task: TaskConfig) -> None:
     """Write the documentation's pictures.
 
     Args:
-        folder: Folder to write to; made if need be.
+        folder: Folder to write to.
         card: The scene to show.
         task: The task, whose layout is drawn.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     pictures = {
         "layout.png": figures.layout_figure(task.scenario),
         "paths.png": card.paths,

@@ -21,6 +21,7 @@ from cura_torchrl.envs.transforms import ConfidenceMap
 from cura_torchrl.modules.map_vae import MapVAE, map_vae_loss
 from cura_torchrl.trainers.decoding import encode
 from cura_torchrl.trainers.errors import RunError
+from cura_torchrl.trainers.folders import make_folder
 from cura_torchrl.trainers.info import git_commit, versions
 from cura_torchrl.trainers.training.map_dataset import (
     MapDataset,
@@ -98,7 +99,7 @@ def pretrain_map(
     Raises:
         RunError: If the maps are of too few episodes to hold one out and to train on another.
     """
-    config.run_dir.mkdir(parents=True, exist_ok=True)
+    make_folder(config.run_dir, "run_dir")
     policy = RandomPusher(noise=config.noise) if policy is None else policy
     data = _maps(config, make_env, policy)
     torch.set_num_threads(config.threads)

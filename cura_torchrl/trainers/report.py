@@ -14,6 +14,7 @@ from cura_torchrl.trainers.build import load_encoder
 from cura_torchrl.trainers.checkpoint import progress_path
 from cura_torchrl.trainers.errors import RunError
 from cura_torchrl.trainers.evaluation.task import evaluation_task
+from cura_torchrl.trainers.folders import make_place
 from cura_torchrl.trainers.loaded_policy import LoadedPolicy, load_policy
 from cura_torchrl.trainers.methods import method_label, policy_labels
 from cura_torchrl.trainers.pages import report_page
@@ -68,16 +69,13 @@ def report(config: ReportConfig) -> Path:
 
     Raises:
         RunError: If what is to be read is missing or damaged; nothing is played then.
-    """
+    """  # noqa: DOC502 - raised by what this calls
     runs = _load_runs(config)
     curves = {run.label: run.rows for run in runs if run.rows}
     curves |= _more_curves(config.curves, taken=curves)
     table = None if config.table is None else read_folder(config.table, TABLE_NAME, "table")
     calibration = None if config.calibration is None else read_folder(config.calibration, CALIBRATION_NAME, "calibrate")
-    config.out.parent.mkdir(parents=True, exist_ok=True)
-    if config.out.is_dir():
-        msg = f"out is {config.out}, a folder; accepted: a file to write"
-        raise RunError(msg)
+    make_place(config.out, "out")
     first = runs[0]
     recordings = _play(config, _players(config, runs))
     card = draw_card(recordings, every=1, frame_time=config.frame_stride * recordings[0].period / _SPEED_UP)

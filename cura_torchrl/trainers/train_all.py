@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from cura_torchrl.trainers.checkpoint import find_checkpoint, read_config, weights_sha256
 from cura_torchrl.trainers.decoding import changed_fields
 from cura_torchrl.trainers.errors import CheckpointError, Interrupted
+from cura_torchrl.trainers.folders import make_folder
 from cura_torchrl.trainers.info import hardware
 from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER, is_locked
 from cura_torchrl.trainers.training.run_status import RunStatus, read_record, read_status, write_record
@@ -180,7 +181,7 @@ class _Schedule:
         except CheckpointError as error:
             self._fail(run, str(error))
             return
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder, "folder of the run")
         if source is None:
             write_record(folder, init_from_sha256=self.starts[run.init_from] if run.init_from else None)
         write_record(folder, error=None)

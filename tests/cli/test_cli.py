@@ -130,6 +130,15 @@ def test_what_cannot_be_written_is_told_in_one_line(shell: str, message: str) ->
     assert len(done.stderr.splitlines()) == 1
 
 
+def test_a_reader_that_has_seen_enough_is_no_error() -> None:
+    """Catches a complaint after ``cura-torchrl ... | head``; 141 is what a shell gives for SIGPIPE."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([*COMMAND, "--help"], stdout=writer, stderr=subprocess.PIPE, timeout=280, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
+
+
 def test_help_of_a_method_shows_its_own_defaults() -> None:
     """Catches flags that show cura-ppo's coefficients whatever the method is."""
     shown = run("train", "--method", "push", "--help").stdout
@@ -201,6 +210,12 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
         (["bench"], "env,learner,lidar,ik,peers"),
         (["bench", "speed"], "speed"),
         (["bench", "env", "--rounds", "0"], "rounds is 0; accepted: 1 or more"),
+        (["bench", "env", "--output", "{tmp}"], "a folder; accepted: a file to write"),
+        (
+            ["demo", "--docs-dir", "/dev/null/docs"],
+            "docs_dir is '/dev/null/docs' (Not a directory); accepted: a folder",
+        ),
+        (["calibrate", "--out", "/dev/null/out"], "out is '/dev/null/out' (Not a directory); accepted: "),
         (["evaluate", "--policy", "scripted", "--object-size", "nan"], "object_size is nan; accepted: finite numbers"),
     ],
 )
