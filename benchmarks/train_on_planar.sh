@@ -3,7 +3,7 @@
 # imitates the scripted avoider with what the method sees. Run it again after an interruption, or with more frames: it goes on from there.
 #   benchmarks/train_on_planar.sh RUNS FRAMES METHOD... [-- FLAG...]
 # FLAG... is handed to `cura-torchrl train`. SEEDS=0,1,2 trains several seeds, JOBS=<n> runs side by side, WORKERS=<n> processes in each,
-# DEVICE=cuda the whole of it on a GPU. STARTS=<folder> holds the warm starts imitate-*, those that are missing are made there:
+# DEVICE=cuda trains on a GPU. STARTS=<folder> holds the warm starts imitate-*, those that are missing are made there:
 # benchmarks/training has those that the shipped policies come from, RUNS is the default. START=<run> is one start for all methods,
 # ENCODER=<file> another encoder than the one that is shipped. STATUS=1 shows how far the runs are, and starts nothing.
 set -euo pipefail
