@@ -141,7 +141,8 @@ def summary_table(cards: Sequence[Card]) -> str:
     first = cards[0].recordings[0]
     caption = (
         f"Success: the box within {first.success_radius:g} m of the goal before any collision. Interval: Wilson's; so "
-        "few scenes leave it wide, <code>cura-torchrl evaluate</code> plays more. "
+        "few scenes leave open which policy is better: docs/results.md has thousands, <code>cura-torchrl table</code> "
+        "plays as many as are wanted. "
         f"Steps of {first.period:g} s until goal, collision or time-out."
     )
     return f"<table><caption>{caption}</caption><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table>"
