@@ -97,6 +97,7 @@ def test_a_gpu_fuses_to_what_is_written(play, function):
 def test_without_a_folder_to_write_functions_are_compiled_anew(monkeypatch):
     """Catches an import that fails in a container whose user can write neither the package's folder nor a home."""
     njit = numba.njit
+    njit(lambda: 0)()  # numba imports parts of itself, which it compiles too, with the first function
 
     def nowhere(*, cache, **options):
         def refuse(function):
