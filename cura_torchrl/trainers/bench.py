@@ -45,7 +45,10 @@ def bench(config: BenchConfig) -> dict[str, Any]:
 
     Returns:
         What the file holds, JSON-compatible.
-    """
+
+    Raises:
+        RunError: If the file cannot be written where it is to be; nothing is measured then.
+    """  # noqa: DOC502 - raised by what this calls
     path = config.output or OUTPUT_FOLDER / f"{config.target}.json"
     make_place(path, "output")  # before minutes of measuring
     load = os.getloadavg()[0]

@@ -54,7 +54,8 @@ def calibrate(config: CalibrateConfig) -> str:
 
     Raises:
         CheckpointError: If a policy's checkpoint is missing or damaged.
-        RunError: If a policy sees no map, or no draw of hidden obstacles agrees with what was seen.
+        RunError: If a policy sees no map, no draw of hidden obstacles agrees with what was seen, or the folder to write
+            to cannot be made.
     """  # noqa: DOC502 - raised by what this calls
     policies = {name: load_policy(name).double() for name in config.methods}
     blind = [name for name, loaded in policies.items() if loaded.config.perception != "map"]

@@ -68,7 +68,7 @@ def demo(config: DemoConfig) -> Path:
         The page.
 
     Raises:
-        RunError: If weights or scenes are missing.
+        RunError: If weights or scenes are missing, or a folder to write to cannot be made.
         WorkerError: If a process that plays or draws dies.
     """  # noqa: DOC502 - raised by what this calls
     loaded = [_load(name, config) for name in config.policies]

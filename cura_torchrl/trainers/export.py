@@ -30,6 +30,7 @@ from cura_torchrl.trainers.build import load_encoder
 from cura_torchrl.trainers.checkpoint import file_sha256
 from cura_torchrl.trainers.deployment.description import Signal, describe, map_signals, policy_signals
 from cura_torchrl.trainers.errors import CheckpointError, RunError, UnavailableError
+from cura_torchrl.trainers.folders import make_folder
 from cura_torchrl.trainers.loaded_policy import LoadedPolicy, load_policy
 
 if TYPE_CHECKING:
@@ -118,7 +119,8 @@ def export(config: ExportConfig) -> Path:
 
     Raises:
         CheckpointError: If the policy sees no map.
-    """
+        RunError: If the folder of the export cannot be made.
+    """  # noqa: DOC502 - raised by what this calls
     _require_installed()
     loaded = load_policy(config.method or config.checkpoint or "")
     if loaded.config.perception != "map":
@@ -126,7 +128,8 @@ def export(config: ExportConfig) -> Path:
         raise CheckpointError(msg)
     stage = config.out.with_name(f".{config.out.name}.partial")
     shutil.rmtree(stage, ignore_errors=True)
-    stage.mkdir(parents=True)
+    make_folder(config.out.parent, "folder of out")
+    stage.mkdir()
     try:
         _fill(stage, loaded, config.check_steps)
         if config.out.exists():

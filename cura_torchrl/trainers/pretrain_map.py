@@ -97,7 +97,8 @@ def pretrain_map(
         Held-out figures, see :func:`measure`.
 
     Raises:
-        RunError: If the maps are of too few episodes to hold one out and to train on another.
+        RunError: If the maps are of too few episodes to hold one out and to train on another, or the folder of the run
+            cannot be made.
     """
     make_folder(config.run_dir, "run_dir")
     policy = RandomPusher(noise=config.noise) if policy is None else policy

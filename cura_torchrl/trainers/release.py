@@ -17,6 +17,7 @@ from cura_torchrl.trainers.checkpoint import (
     write_checkpoint,
 )
 from cura_torchrl.trainers.errors import CheckpointError, UnavailableError
+from cura_torchrl.trainers.folders import make_folder
 from cura_torchrl.trainers.loaded_policy import SHIPPED_FOLDER, read_networks
 from cura_torchrl.trainers.training.run_folder import CHECKPOINT_FOLDER
 
@@ -36,6 +37,7 @@ def release(source: Path, destination: Path | None = None) -> Path:
 
     Raises:
         CheckpointError: If there is no checkpoint or it is damaged, or ``destination`` holds anything but weights.
+        RunError: If the folder of ``destination`` cannot be made.
         UnavailableError: If its encoder is not the one that is shipped: whoever loads it would play with another.
     """  # noqa: DOC502 - raised by what this calls
     path = find_checkpoint(source)
@@ -46,7 +48,7 @@ def release(source: Path, destination: Path | None = None) -> Path:
     networks = read_networks(path, config)
     # Paths of the machine that trained say nothing elsewhere.
     released = config.replace(run_dir=Path("runs") / config.method, encoder=None)
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(folder.parent, "folder of destination")
     curve = progress_path(path)
     if curve.exists():
         shutil.copyfile(curve, progress_path(folder))

@@ -68,7 +68,8 @@ def report(config: ReportConfig) -> Path:
         The page.
 
     Raises:
-        RunError: If what is to be read is missing or damaged; nothing is played then.
+        RunError: If what is to be read is missing or damaged, or the page is to be where a folder is; nothing is
+            played then.
     """  # noqa: DOC502 - raised by what this calls
     runs = _load_runs(config)
     curves = {run.label: run.rows for run in runs if run.rows}

@@ -20,6 +20,7 @@ from cura_torchrl.trainers.checkpoint import CHECKPOINT_FOLDER, save_checkpoint
 from cura_torchrl.trainers.config import EvaluateConfig, TrainConfig
 from cura_torchrl.trainers.deployment.config import ExportConfig
 from cura_torchrl.trainers.evaluation.table_config import TableConfig
+from cura_torchrl.trainers.loaded_policy import SHIPPED_FOLDER
 from cura_torchrl.trainers.methods import PRESETS, method
 from cura_torchrl.trainers.pages.demo_config import DemoConfig
 from cura_torchrl.trainers.pages.report_config import ReportConfig
@@ -172,6 +173,11 @@ def test_help_of_a_method_shows_its_own_defaults() -> None:
         (["export", "--method", "cura"], "method is 'cura'"),
         (["export", "--method", "push", "--out", "/"], "out is '/'; accepted: a folder that is empty or not there"),
         (["export", "--method", "push", "--out", "."], "out is '.'; accepted: a folder that is empty or not there"),
+        (["export", "--method", "push", "--out", "/dev/null/a/b"], "folder of out is '/dev/null/a' (Not a directory)"),
+        (
+            ["release", "--checkpoint", str(SHIPPED_FOLDER / "push"), "--destination", "/dev/null/a/b"],
+            "folder of destination is '/dev/null/a' (Not a directory)",
+        ),
         (["imitate", "--method", "cura-pro"], "method is 'cura-pro' (did you mean cura-ppo?)"),
         (["imitate", "--seed", "-1"], "seed is -1; accepted: 0 to 2147483647"),
         (["evaluate", "--method", "push", "--robot", "ridgeback"], "robot is 'ridgeback'; accepted: nothing beside"),
